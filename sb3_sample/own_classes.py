@@ -118,6 +118,28 @@ def _check_signature(argument: str, cls: type, base: type, name: str) -> None:
         ) from error
 
 
+def is_derived(cls: Any, base: type) -> bool:
+    """
+    :param cls: a class, or anything else
+    :param base: base class
+    :return: whether it is a class derived from the base
+    """
+    return isinstance(cls, type) and issubclass(cls, base)
+
+
+def defaults_for(cls: Any, base: type, **defaults: Any) -> dict[str, Any]:
+    """
+    Find which of an agent's defaults a part has.
+
+    :param cls: class of the part, or anything else
+    :param base: base class of the parts that the defaults are for
+    :param defaults: arguments with the agent's defaults
+    :return: those that the class takes by name; none if it is not derived from the base
+    """
+    taken = inspect.signature(cls).parameters if is_derived(cls, base) else {}
+    return {name: value for name, value in defaults.items() if name in taken}
+
+
 def names_in(value: Any) -> Iterator[str]:
     """Attributes and functions that a method uses."""
     functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(_function_of(value)),)

@@ -47,6 +47,7 @@ from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.projected import Projected
 from sb3_sample.optim import AdamW
+from sb3_sample.warn import warn
 
 
 def check_is_batch(batch: Any) -> None:
@@ -574,6 +575,12 @@ class Learner(Executable):
         with self._random():
             if self._heard:
                 self.before_updates()
+            scaler = self.reward_scaler
+            if scaler is not None and scaler.needs_steps and self.num_transitions == 0:
+                warn(
+                    f"{type(scaler).__name__} scales rewards by returns, and this learner was told of no step: call "
+                    "its on_step at those of the environments, or pass reward_scale=None, or 'linear'"
+                )
             self.plasticity.before_gradient_steps(self, 1)
             # A compiled or captured step receives the rates, settings and moments set since the last one.
             self.prepared_execution()

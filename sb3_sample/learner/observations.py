@@ -28,14 +28,16 @@ class Observations:
         for key, (value, of) in entries.items():
             self._is_array = not isinstance(value, torch.Tensor)
             shape = tuple(np.shape(value)) if self._is_array else tuple(value.shape)
-            self._is_single = shape == of.shape
+            is_single = shape == of.shape
+            # A batch of one may tell its task by a number alone.
+            self._is_single = self._is_single and is_single
             # Integers of a Discrete space are (B,) or (B, 1).
-            if not (self._is_single or (len(shape) > 0 and (shape[1:] == of.shape or of.shape == ()))):
+            if not (is_single or (len(shape) > 0 and (shape[1:] == of.shape or of.shape == ()))):
                 what = f"observations[{key!r}]" if key else "observations"
                 batch = f"({', '.join(map(str, ('B', *of.shape)))}{',' if not of.shape else ''})"
                 raise ValueError(f"{what} must have the shape {batch} or {of.shape}, not {shape}")
             tensor = torch.as_tensor(value, device=device)
-            tensors[key] = tensor.unsqueeze(0) if self._is_single else tensor
+            tensors[key] = tensor.unsqueeze(0) if is_single else tensor
         if len({len(tensor) for tensor in tensors.values()}) > 1:
             sizes = {key: len(tensor) for key, tensor in tensors.items()}
             raise ValueError(f"observations must be as many under each key, not {sizes}")

@@ -298,7 +298,14 @@ class TaskScale(RewardScale):
         self.divisors.copy_(((size - entropy) / self.max_return).clamp(min=1e-8))
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
-        return self.divisors[0] if task is None or len(self.divisors) == 1 else self.divisors[task]
+        if len(self.divisors) == 1:
+            return self.divisors[0]
+        if task is None:
+            raise ValueError(
+                f"reward_scale='brc' with n_tasks={len(self.divisors)} needs the task of each transition: dict "
+                "observations with the key 'task', or a batch with such a column"
+            )
+        return self.divisors[task]
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"episodes": [list(episode) for episode in self._episodes]}
@@ -384,3 +391,13 @@ REWARD_SCALES: dict[str, type[RewardScale]] = {
     "simbav2": StdOrMaxScale,
     "xqc": StdScale,
 }
+
+
+def rule_of(reward_scale: str | type[RewardScale] | None) -> type[RewardScale] | None:
+    """
+    Look up a rule.
+
+    :param reward_scale: its name or class, or None
+    :return: its class; None for None and for a name that is none
+    """
+    return REWARD_SCALES.get(reward_scale) if isinstance(reward_scale, str) else reward_scale

@@ -33,7 +33,7 @@ from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, no
 from sb3_sample.kinds import ABOVE_0, check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
-from sb3_sample.learner.reward_scale import REWARD_SCALES, LinearScale
+from sb3_sample.learner.reward_scale import LinearScale, rule_of
 from sb3_sample.learner.scalars import FixedScalar
 from sb3_sample.replay.buffers import (
     WITH_SPLIT,
@@ -329,7 +329,7 @@ class SAC(  # type: ignore[misc]  # actor
         except BadFile:
             # A class that is not trusted to be named by the file, and is passed in its place.
             return kwargs
-        if _rule(kwargs["reward_scale"]) is _rule(theirs):
+        if rule_of(kwargs["reward_scale"]) is rule_of(theirs):
             return kwargs
         # Another rule has other statistics.
         content.start_anew("reward_scaler")
@@ -785,11 +785,6 @@ class SAC(  # type: ignore[misc]  # actor
         if errors is not None and isinstance(self.replay_buffer, PrioritizedReplay):
             self.replay_buffer.renew(batch.columns[SLOTS], errors)
         return metrics
-
-
-def _rule(reward_scale: Any) -> Any:
-    """The class of a rule that scales rewards, which may be given by its name."""
-    return REWARD_SCALES.get(reward_scale, reward_scale) if isinstance(reward_scale, str) else reward_scale
 
 
 def _in_file(content: Any, name: str) -> Any:

@@ -167,8 +167,9 @@ class SACArguments(Resumable):
     final_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
     """rate at the end of the schedule"""
     schedule_steps: int | None = argument(default=None, kind=integer(1).or_none("those of the first learn"))
-    """planned gradient steps; None: environment steps of the first ``learn``, random ones included, times the replay
-    ratio; later calls do not change the number"""
+    """planned gradient steps, counted from the model's first; None: environment steps of the first ``learn`` with
+    gradient steps, random ones included, times the replay ratio; later calls do not change the number. A schedule given
+    to ``load`` continues from the gradient steps taken, as if it had been there before"""
     warm_up_steps: int = argument(default=0, kind=integer(0))
     """planned gradient steps before the decay, in which the rate rises linearly to ``learning_rate``"""
     warm_up_learning_rate: float | None = argument(default=0.0, kind=AT_LEAST_0.or_none("learning_rate"))

@@ -5,10 +5,11 @@ from typing import Any, ClassVar
 from sb3_sample.arguments import check_unused
 from sb3_sample.constructor import argument
 from sb3_sample.kinds import AT_LEAST_0, integer
-from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
+from sb3_sample.learner.categorical import CategoricalHead, head_of
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.own_classes import defaults_for
 from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.multi_task import TaskEmbedding
@@ -70,11 +71,8 @@ class BRC(SAC):
                     "the embeddings of the tasks are the critics': leave it out, or pass a features_extractor_class"
                 )
 
-    def _full_value_head_kwargs(self) -> dict[str, Any]:
-        kwargs: dict[str, Any] = super()._full_value_head_kwargs()
-        cls = VALUE_HEADS.get(self.value_head) if isinstance(self.value_head, str) else None
-        is_categorical = cls is not None and issubclass(cls, CategoricalHead)
-        return {"v_min": -10.0, "v_max": 10.0, **kwargs} if is_categorical else kwargs
+    def _value_head_defaults(self) -> dict[str, Any]:
+        return defaults_for(head_of(self.value_head), CategoricalHead, v_min=-10.0, v_max=10.0)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = {

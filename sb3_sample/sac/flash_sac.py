@@ -8,10 +8,11 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_sample.arguments import default_of
 from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0
-from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
+from sb3_sample.learner.categorical import CategoricalHead, head_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.own_classes import defaults_for
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policy_kwargs import with_networks
 
@@ -107,10 +108,8 @@ class FlashSAC(SAC):
     def _auto_target_entropy(self, action_dim: int) -> float:
         return action_dim * math.log(2 * math.pi * math.e * self.target_std**2) / 2
 
-    def _full_value_head_kwargs(self) -> dict[str, Any]:
-        kwargs: dict[str, Any] = super()._full_value_head_kwargs()
-        cls = VALUE_HEADS.get(self.value_head) if isinstance(self.value_head, str) else None
-        return {"average_critics": True, **kwargs} if cls is not None and issubclass(cls, CategoricalHead) else kwargs
+    def _value_head_defaults(self) -> dict[str, Any]:
+        return defaults_for(head_of(self.value_head), CategoricalHead, average_critics=True)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         return with_networks(super()._full_policy_kwargs(), "flash", _SIZES)

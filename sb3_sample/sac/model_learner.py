@@ -23,7 +23,7 @@ from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
-from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale, TaskScale, rule_of
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.transforms import BatchTransform
@@ -314,14 +314,20 @@ class HasLearner:
         """
         :return: the value head's arguments: the user's and the algorithm's
         """
-        return dict(self.value_head_kwargs or {})
+        return {**self._value_head_defaults(), **(self.value_head_kwargs or {})}
+
+    def _value_head_defaults(self: Any) -> dict[str, Any]:
+        """
+        :return: the algorithm's own defaults of the value head's arguments
+        """
+        return {}
 
     def _full_reward_scale_kwargs(self: Any) -> dict[str, Any]:
         """
         :return: the arguments of the rule that scales rewards: the user's and the algorithm's
         """
-        kwargs = dict(self.reward_scale_kwargs or {})
-        return {"n_tasks": self.n_tasks, **kwargs} if self.reward_scale == "brc" else kwargs
+        defaults = own_classes.defaults_for(rule_of(self.reward_scale), TaskScale, n_tasks=self.n_tasks)
+        return {**defaults, **(self.reward_scale_kwargs or {})}
 
     def _full_pessimism_kwargs(self: Any) -> dict[str, Any]:
         """

@@ -63,7 +63,9 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         return n_steps if self._learns_from is not None else super()._updates_in(n_steps)
 
     def _after_turns(self: Any) -> None:
-        """Warn if nothing was learned because there were too few steps."""
+        """Warn if nothing was learned because there were too few steps; the next ``learn`` then plans."""
+        if self._n_updates == 0:
+            self.planned_updates = self.schedule_steps
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
             return

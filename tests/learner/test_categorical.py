@@ -12,8 +12,8 @@ from sb3_sample import BROFast, DiagnosticsCallback
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.categorical import CategoricalHead, HLGaussHead
 from sb3_sample.learner.pessimism import Pessimism
-from sb3_sample.sac import SAC
-from tests.sac.common import TINY_BRO, bro, differing, sac, state, vec
+from sb3_sample.sac import BRC, SAC
+from tests.sac.common import MAKERS, TINY_BRO, bro, differing, sac, state, vec
 
 
 def batch(rewards: list[float], dones: list[float], gamma: float = 0.5) -> Batch:
@@ -101,6 +101,21 @@ def test_an_ensemble_is_one_distribution() -> None:
     assert shift < 0
     by_hand = head.project(torch.tensor([first]), (head.support + shift)[None])
     torch.testing.assert_close(target(head, batch([0.0], [0], gamma=1.0), q, beta=2.0), by_hand)
+
+
+def test_an_agents_support_and_loss_are_those_of_a_head_by_class_too(tmp_path: Path) -> None:
+    class Mine(CategoricalHead):
+        def __init__(self) -> None:
+            super().__init__(n_atoms=7, v_min=-1.0, v_max=1.0)
+
+    for head in ("categorical", CategoricalHead):
+        model = MAKERS["BRC"](value_head=head, value_head_kwargs={"n_atoms": 7})
+        assert (model.head.v_min, model.head.v_max) == (-10, 10)
+        assert MAKERS["FlashSAC"](value_head=head).head.average_critics
+    for maker in ("BRC", "FlashSAC"):
+        assert MAKERS[maker](value_head=Mine, value_head_kwargs=None).head.v_max == 1
+    MAKERS["BRC"]().save(tmp_path / "m")
+    assert BRC.load(tmp_path / "m", value_head=CategoricalHead).head.v_max == 10
 
 
 def test_hl_gauss_by_hand() -> None:

@@ -369,6 +369,29 @@ def test_tasks_told_by_tensors() -> None:
         assert scale.largest.tolist() == [-math.inf, 3.0]
 
 
+def test_several_tasks_need_the_task_of_each_transition() -> None:
+    scale: Any = REWARD_SCALES["brc"](learner(), n_tasks=2)
+    with pytest.raises(ValueError, match="reward_scale='brc' with n_tasks=2 needs the task of each transition"):
+        scale.divisor(None)
+
+
+def test_a_shift_by_class_is_refused_like_one_by_name() -> None:
+    for rule in ("linear", REWARD_SCALES["linear"]):
+        with pytest.raises(ValueError, match="shift=-1 of reward_scale_kwargs would be added once"):
+            sac(reward_scale=rule, reward_scale_kwargs={"shift": -1}, n_steps=3)
+
+
+def test_a_learner_that_is_told_of_no_step() -> None:
+    given = SAC.learner(*(getattr(vec(), f"{name}_space") for name in ("observation", "action")), reward_scale="xqc")
+    batch = random_batch(sac(), seed=0)
+    with pytest.warns(UserWarning, match="StdScale scales rewards by returns, and this learner was told of no step"):
+        given.update(batch)
+    given.on_step(np.ones(1), np.zeros(1, dtype=bool), [{}])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        given.update(batch)
+
+
 def test_one_task_is_not_looked_up() -> None:
     """With one task, "task" is anything: a name in the infos, two numbers among the observations."""
     of, o = learner(), torch.zeros(2, 1)

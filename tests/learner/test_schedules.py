@@ -15,6 +15,18 @@ from sb3_sample.sac import SAC, XQC
 from tests.sac.common import COMPILES, MAKERS, bro, differing, random_batch, sac, state, vec
 
 
+def test_a_learn_that_ends_in_the_warm_up_plans_nothing(tmp_path: Path) -> None:
+    model = sac(learning_rate_schedule="linear", replay_ratio=2, learning_starts=10)
+    with pytest.warns(UserWarning, match="learn ended without a single gradient step"):
+        model.learn(10)
+    assert model.planned_updates is None and model._n_updates == 0
+    assert model.learn(30, reset_num_timesteps=False).planned_updates == 60
+    assert model.learner.scheduled_rate == pytest.approx(0, abs=1e-12)
+    with pytest.warns(UserWarning, match="learn ended without a single gradient step"):
+        given = sac(learning_rate_schedule="linear", learning_starts=10, schedule_steps=70).learn(10)
+    assert given.planned_updates == 70
+
+
 def test_a_learn_without_gradient_steps_plans_nothing() -> None:
     model = sac(learning_rate_schedule="linear", replay_ratio=0, learning_starts=10).learn(20)
     assert model.planned_updates is None and model._n_updates == 0

@@ -24,6 +24,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_sample import Dataset, DiagnosticsCallback, MultiTaskEvalCallback, evaluate_tasks, multi_task_env, study
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.group import LearnerGroup
+from sb3_sample.learner.reward_scale import TaskScale
 from sb3_sample.learner.scalars import TaskLogScalar
 from sb3_sample.learner.target import next_step
 from sb3_sample.learner.transforms import BatchTransform
@@ -175,6 +176,22 @@ def test_steps_of_each_task_are_saved(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- temperatures
+
+
+def test_rewards_are_scaled_by_task_by_name_and_class() -> None:
+    class Mine(TaskScale):
+        pass
+
+    for rule in ("brc", TaskScale, Mine):
+        assert make("BRC", reward_scale=rule).reward_scaler.divisors.shape == (2,)
+
+
+def test_one_observation_is_a_batch_if_only_its_task_is_a_number() -> None:
+    learner = make("BRC").learner
+    rows = torch.zeros(1, *learner.networks.observation_space["observation"].shape)
+    for task in (np.array(1), np.array([1])):
+        assert learner.act({"observation": rows.numpy(), "task": task}).shape == (1, learner.actor.action_dim)
+    assert learner.act({"observation": rows[0].numpy(), "task": np.array(1)}).shape == (learner.actor.action_dim,)
 
 
 def batch_of(model: Any, n: int = 6, seed: int = 0) -> Any:
