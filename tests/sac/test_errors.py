@@ -261,7 +261,7 @@ def test_a_training_within_the_warm_up_says_so(n_envs: int, tmp_path: Path) -> N
     [
         ({}, {"total_timesteps": 0}),
         ({"replay_ratio": 0}, {}),
-        ({"gradient_steps": 0}, {}),
+        ({"gradient_steps": 0, "replay_ratio": None}, {}),
         ({}, {"callback": Stops()}),
         ({"learning_starts": 9}, {}),
         ({"learning_starts": 0, "replay_ratio": 0.01}, {}),
