@@ -151,4 +151,13 @@ def chosen(name: str, value: Any, table: Mapping[str, Any], base: type) -> Any:
     :raises ValueError: if it is neither
     """
     check_value(name, value, one_of(table, base))
-    return table[value] if isinstance(value, str) else value
+    return choice_of(value, table)
+
+
+def choice_of(value: Any, table: Mapping[str, Any]) -> Any:
+    """
+    :param value: value of an argument, the name of a choice or anything else
+    :param table: choices by name
+    :return: the choice of that name, None for a name that is none; anything else as it is
+    """
+    return table.get(value) if isinstance(value, str) else value

@@ -173,13 +173,3 @@ VALUE_HEADS: dict[str, type[ValueHead]] = {
     "half_squared": HalfSquaredHead,
     "hl_gauss": HLGaussHead,
 }
-
-
-def head_of(value_head: str | type[ValueHead] | None) -> type[ValueHead] | None:
-    """
-    Look up a head.
-
-    :param value_head: its name or class, or None
-    :return: its class; None for None and for a name that is none
-    """
-    return VALUE_HEADS.get(value_head) if isinstance(value_head, str) else value_head

@@ -391,13 +391,3 @@ REWARD_SCALES: dict[str, type[RewardScale]] = {
     "simbav2": StdOrMaxScale,
     "xqc": StdScale,
 }
-
-
-def rule_of(reward_scale: str | type[RewardScale] | None) -> type[RewardScale] | None:
-    """
-    Look up a rule.
-
-    :param reward_scale: its name or class, or None
-    :return: its class; None for None and for a name that is none
-    """
-    return REWARD_SCALES.get(reward_scale) if isinstance(reward_scale, str) else reward_scale

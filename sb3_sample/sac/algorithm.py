@@ -30,10 +30,10 @@ from sb3_sample.arguments import check_every, check_program, default_of, named_p
 from sb3_sample.constructor import Given
 from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
-from sb3_sample.kinds import ABOVE_0, check_value, instance, integer
+from sb3_sample.kinds import ABOVE_0, check_value, choice_of, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
-from sb3_sample.learner.reward_scale import LinearScale, rule_of
+from sb3_sample.learner.reward_scale import REWARD_SCALES, LinearScale
 from sb3_sample.learner.scalars import FixedScalar
 from sb3_sample.replay.buffers import (
     WITH_SPLIT,
@@ -329,7 +329,7 @@ class SAC(  # type: ignore[misc]  # actor
         except BadFile:
             # A class that is not trusted to be named by the file, and is passed in its place.
             return kwargs
-        if rule_of(kwargs["reward_scale"]) is rule_of(theirs):
+        if choice_of(kwargs["reward_scale"], REWARD_SCALES) is choice_of(theirs, REWARD_SCALES):
             return kwargs
         # Another rule has other statistics.
         content.start_anew("reward_scaler")

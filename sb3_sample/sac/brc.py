@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 from sb3_sample.arguments import check_unused
 from sb3_sample.constructor import argument
-from sb3_sample.kinds import AT_LEAST_0, integer
-from sb3_sample.learner.categorical import CategoricalHead, head_of
+from sb3_sample.kinds import AT_LEAST_0, choice_of, integer
+from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.reward_scale import RewardScale
@@ -72,7 +72,7 @@ class BRC(SAC):
                 )
 
     def _value_head_defaults(self) -> dict[str, Any]:
-        return defaults_for(head_of(self.value_head), CategoricalHead, v_min=-10.0, v_max=10.0)
+        return defaults_for(choice_of(self.value_head, VALUE_HEADS), CategoricalHead, v_min=-10.0, v_max=10.0)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = {

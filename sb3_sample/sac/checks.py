@@ -15,6 +15,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_sample.arguments import NotAllowed, check_every, check_unused, default_of
 from sb3_sample.kinds import (
     check_value,
+    choice_of,
     integer,
     one_of,
 )
@@ -22,7 +23,7 @@ from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
-from sb3_sample.learner.reward_scale import LinearScale, TaskScale, rule_of
+from sb3_sample.learner.reward_scale import REWARD_SCALES, LinearScale, TaskScale
 from sb3_sample.own_classes import is_derived
 from sb3_sample.replay.buffers import (
     WITH_SPLIT,
@@ -74,7 +75,7 @@ def check(agent: Any) -> None:
         check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
     check_one_reward_scale(agent)
     shift = (agent.reward_scale_kwargs or {}).get("shift", 0)
-    if is_derived(rule_of(agent.reward_scale), LinearScale) and shift != 0 and agent.n_steps > 1:
+    if is_derived(choice_of(agent.reward_scale, REWARD_SCALES), LinearScale) and shift != 0 and agent.n_steps > 1:
         raise ValueError(
             f"shift={shift} of reward_scale_kwargs would be added once to the returns of "
             f"n_steps={agent.n_steps} steps: pass n_steps=1, or no shift"
@@ -352,7 +353,7 @@ def _check_tasks(agent: Any) -> None:
         # Both look up a task's values by its number.
         for name, value, by_task in (
             ("task_temperatures", agent.task_temperatures, agent.task_temperatures),
-            ("reward_scale", agent.reward_scale, is_derived(rule_of(agent.reward_scale), TaskScale)),
+            ("reward_scale", agent.reward_scale, is_derived(choice_of(agent.reward_scale, REWARD_SCALES), TaskScale)),
         ):
             if by_task:
                 raise ValueError(

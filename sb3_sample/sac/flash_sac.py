@@ -7,8 +7,8 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sample.arguments import default_of
 from sb3_sample.constructor import Given, argument
-from sb3_sample.kinds import ABOVE_0
-from sb3_sample.learner.categorical import CategoricalHead, head_of
+from sb3_sample.kinds import ABOVE_0, choice_of
+from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.reward_scale import RewardScale
@@ -109,7 +109,7 @@ class FlashSAC(SAC):
         return action_dim * math.log(2 * math.pi * math.e * self.target_std**2) / 2
 
     def _value_head_defaults(self) -> dict[str, Any]:
-        return defaults_for(head_of(self.value_head), CategoricalHead, average_critics=True)
+        return defaults_for(choice_of(self.value_head, VALUE_HEADS), CategoricalHead, average_critics=True)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         return with_networks(super()._full_policy_kwargs(), "flash", _SIZES)

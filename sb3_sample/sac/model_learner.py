@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from sb3_sample import own_classes
-from sb3_sample.kinds import check_value, chosen, integer
+from sb3_sample.kinds import check_value, choice_of, chosen, integer
 from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
@@ -23,7 +23,7 @@ from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
-from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale, TaskScale, rule_of
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale, TaskScale
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.transforms import BatchTransform
@@ -326,7 +326,8 @@ class HasLearner:
         """
         :return: the arguments of the rule that scales rewards: the user's and the algorithm's
         """
-        defaults = own_classes.defaults_for(rule_of(self.reward_scale), TaskScale, n_tasks=self.n_tasks)
+        rule = choice_of(self.reward_scale, REWARD_SCALES)
+        defaults = own_classes.defaults_for(rule, TaskScale, n_tasks=self.n_tasks)
         return {**defaults, **(self.reward_scale_kwargs or {})}
 
     def _full_pessimism_kwargs(self: Any) -> dict[str, Any]:
