@@ -16,14 +16,8 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_sample.envs.atari import is_atari
-from sb3_sample.envs.states import (
-    layers_of,
-    model_arrays,
-    more_model_arrays,
-    options_of,
-    set_model_numbers,
-    simulator_of,
-)
+from sb3_sample.envs.mujoco_model import model_arrays, more_model_arrays, options_of, set_model_numbers
+from sb3_sample.envs.states import layers_of, simulator_of
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 
 #: Attribute that :mod:`sb3_sample.saving.vec_envs` sets in an environment of another process.

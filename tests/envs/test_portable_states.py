@@ -11,8 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.mujoco_model import more_model_arrays
 from sb3_sample.envs.portable_states import pack, unpack
-from sb3_sample.envs.states import layers_of, more_model_arrays, restore_state, save_state, simulator_of
+from sb3_sample.envs.states import layers_of, restore_state, save_state, simulator_of
 from sb3_sample.saving import container
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name, same
 from sb3_sample.saving.encoding import decode, encode
