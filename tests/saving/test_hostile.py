@@ -33,6 +33,7 @@ from sb3_sample.ppo import MBMAPPO
 from sb3_sample.sac import SAC
 from sb3_sample.sac.bro import BRO
 from sb3_sample.saving import BadFile, container, load_vec_normalize, save_vec_normalize
+from tests.memory import forget_peak, peak
 from tests.ppo.common import tiny
 from tests.sac.common import bro, differing, sac, state, vec
 from tests.saving import hostile_values
@@ -183,20 +184,6 @@ class Watch:
 @cache
 def watch() -> Watch:
     return Watch()
-
-
-def peak() -> int:
-    """Bytes that were in memory at most, since ``forget_peak`` where Linux has it, else since the start."""
-    try:
-        status = Path("/proc/self/status").read_text()
-        return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) * 1024
-    except (OSError, StopIteration):
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-def forget_peak() -> None:
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
 
 
 def throw(target: str, case: Case, folder: Path) -> dict[str, Any]:
