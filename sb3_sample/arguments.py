@@ -3,7 +3,7 @@
 import difflib
 import inspect
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -41,6 +41,13 @@ EVERY_POLICY: dict[str, Kind] = {
     "features_extractor_class": maker(BaseFeaturesExtractor, "NatureCNN"),
     "features_extractor_kwargs": DICT,
     "activation_fn": maker(nn.Module, "torch.nn.ReLU").or_none(),
+}
+#: Arguments of policies, optimizers and replay buffers that follow from the algorithm's.
+_OF_POLICY = dict.fromkeys(("observation_space", "action_space", "lr_schedule"), "")
+_OF_OPTIMIZER = {"params": "", "lr": "learning_rate"}
+OF_BUFFER = {
+    **dict.fromkeys(("observation_space", "action_space", "env", "n_envs"), "env"),
+    **{name: name for name in ("buffer_size", "device", "optimize_memory_usage")},
 }
 _ENVIRONMENT = Kind(
     "be an environment, a vectorised environment or the id of one",
@@ -85,7 +92,11 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
     for name, kind in EVERY_POLICY.items():
         if name in kwargs:
             check_value(f"policy_kwargs[{name!r}]", kwargs[name], kind)
-    _check_names(kwargs, agent.policy_class)
+    check_kwargs("policy_kwargs", kwargs, agent.policy_class, _OF_POLICY)
+    optimizer = kwargs.get("optimizer_class") or _default_optimizer(agent.policy_class)
+    if isinstance(optimizer, type):
+        of_optimizer = kwargs.get("optimizer_kwargs") or {}
+        check_kwargs("policy_kwargs['optimizer_kwargs']", of_optimizer, optimizer, _OF_OPTIMIZER)
     policy = named_policy(agent)
     if policy is None or space is None or "features_extractor_class" in kwargs:
         return
@@ -102,6 +113,16 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
         )
 
 
+def _default_optimizer(policy: type) -> Any:
+    """Default of ``optimizer_class``, which a derived policy may pass on as ``**kwargs``."""
+    for base in policy.__mro__:
+        if "__init__" in vars(base):
+            parameter = inspect.signature(vars(base)["__init__"]).parameters.get("optimizer_class")
+            if parameter is not None:
+                return parameter.default
+    return None
+
+
 def _check_schedule(name: str, schedule: Callable[[float], Any]) -> None:
     """Check that a function gives a number at the begin, where Stable-Baselines3 first calls it."""
     try:
@@ -114,20 +135,32 @@ def _check_schedule(name: str, schedule: Callable[[float], Any]) -> None:
     check_value(f"{name}, {schedule!r}, at the begin", first, AT_LEAST_0)
 
 
-def _check_names(policy_kwargs: Mapping[str, Any], policy: type) -> None:
-    """Check that a policy takes the arguments of these names."""
+def check_kwargs(argument: str, kwargs: Iterable[str], of: type, fixed: Mapping[str, str]) -> None:
+    """
+    Check the names of a class's arguments.
+
+    :param argument: name of the argument that has them
+    :param kwargs: their names
+    :param of: the class
+    :param fixed: names of those that follow from the algorithm's arguments, and from which; "" if from none
+    :raises ValueError: if the class takes no argument of a name, or it follows from another
+    """
     allowed: set[str] = set()
-    for base in policy.__mro__:
+    for base in of.__mro__:
         if "__init__" in vars(base):
             parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())
             allowed |= {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
             if not any(each.kind is each.VAR_KEYWORD for each in parameters):
                 break
-    allowed -= {"self", "observation_space", "action_space", "lr_schedule"}
-    for name in policy_kwargs.keys() - allowed:
+    allowed -= {"self", *fixed}
+    for name in kwargs:
+        if name in allowed:
+            continue
+        if other := fixed.get(name):
+            raise ValueError(f"{argument} has {name!r}, which follows from {other}: pass that instead")
         near = difflib.get_close_matches(str(name), allowed, 1)
-        meant = f"Did you mean {near[0]!r}?" if near else f"It takes {sorted(allowed)}"
-        raise ValueError(f"policy_kwargs has {name!r}, which is no argument of {policy.__name__}. {meant}")
+        meant = f"Did you mean {near[0]!r}?" if near else f"It takes {sorted(allowed) or 'none'}"
+        raise ValueError(f"{argument} has {name!r}, which is no argument of {of.__name__}. {meant}")
 
 
 def named_policy(agent: Any) -> str | None:
@@ -298,9 +331,10 @@ def naming_changes(kwargs: dict[str, Any]) -> Iterator[None]:
         yield
     except (RuntimeError, ValueError) as error:
         words = ("loading state_dict", "is an invalid object name", "do not match agents' parameters")
-        if kwargs and (isinstance(error, ParametersDoNotFit) or any(word in str(error) for word in words)):
+        names = sorted(kwargs.keys() - {"seed", "tensorboard_log", "verbose"})
+        if names and (isinstance(error, ParametersDoNotFit) or any(word in str(error) for word in words)):
             raise ValueError(
-                f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks or parts than the "
+                f"{', '.join(names)}: with these arguments the model has other networks or parts than the "
                 f"file ({str(error).splitlines()[0]})"
             ) from error
         raise

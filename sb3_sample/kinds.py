@@ -104,6 +104,8 @@ UNIT = number("lie in [0, 1]", lambda value: 0 <= value <= 1)
 AT_LEAST_0 = number("be at least 0 and finite", lambda value: 0 <= value < math.inf)
 ABOVE_0 = number("be above 0 and finite", lambda value: 0 < value < math.inf)
 LEARNING_RATE = AT_LEAST_0.otherwise("a schedule", callable)
+#: Seeds that NumPy takes.
+SEED = integer(0, 2**32 - 1)
 FINITE = number("be a finite number", math.isfinite)
 DICT = Kind("be a dict", lambda value: isinstance(value, dict)).or_none()
 TRUE_OR_FALSE = Kind("be True or False", lambda value: isinstance(value, (bool, np.bool_)))

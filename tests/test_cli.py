@@ -77,6 +77,8 @@ def test_an_unknown_command_is_refused(run) -> None:
         ),
         (["train", "-params", "policy_kwargs:'dict('"], "a hyperparameter that is a text of Python is none"),
         (["train", "-params", "replay_ratio:-1"], "replay_ratio must be at least 0 and finite, or None, not -1"),
+        (["train", "-params", "replay_buffer_kwargs:dict(x=3)"], "replay_buffer_kwargs has 'x', which is no argument"),
+        (["train", "-i", "logs/model.zip"], "-i must be a .zip file of a model, not 'logs/model.zip', which is not th"),
         (["train", "--env", "Pendulum-v9"], "Pendulum-v9 not found in gym registry"),
     ],
 )
@@ -89,6 +91,8 @@ def test_a_wrong_argument_is_one_line(
     assert caught.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"sb3-sample {command}: ")
+    # Otherwise enjoy would take it for the latest run.
+    assert not list(Path("logs").rglob("Pendulum-v1_*"))
 
 
 def test_an_error_of_anything_else_keeps_its_traceback(zoo_run, monkeypatch: pytest.MonkeyPatch) -> None:

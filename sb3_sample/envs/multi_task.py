@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sample.envs.registration import PACKAGE, make_env, register_all
 from sb3_sample.envs.suites import SUITES
+from sb3_sample.kinds import SEED, check_value
 
 
 class TaskEnv(gym.Wrapper):
@@ -97,10 +98,11 @@ def multi_task_env(
     :param vec_env_kwargs: its arguments
     :param monitor_dir: folder of Monitor's files, ``<task>.monitor.csv``; None for none
     :return: the vectorised environment
-    :raises ValueError: if an id is unknown or given twice, or a task has other observations than vectors of floats, or
-        other actions than a bounded Box of one axis; the message names it
+    :raises ValueError: if an id is unknown or given twice, a task has other observations than vectors of floats, or
+        other actions than a bounded Box of one axis, or the seed is none; the message names it
     :raises ImportError: the library of a task is not installed; the message says how to install it
     """
+    check_value("seed", seed, SEED.or_none())
     task_ids = _task_ids(ids)
     kwargs = dict(env_kwargs or {})
     made: list[gym.Env] = []

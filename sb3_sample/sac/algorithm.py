@@ -74,6 +74,7 @@ from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
 from sb3_sample.saving.unsaved import plain_attributes
 from sb3_sample.training.resumable import Resumable
+from sb3_sample.training.task_evaluation import check_tasks, tasks_of
 from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="SAC")
@@ -189,6 +190,8 @@ class SAC(  # type: ignore[misc]  # actor
         # Whether the ``learn`` under way acts in a separate thread, and at how many steps a second; and that thread.
         self._acts_at: tuple[bool, float | None] = (False, None)
         self._apart: Apart | None = None
+        #: Ids of the tasks of ``multi_task_env``, in the order of their numbers; None for other environments.
+        self.task_ids: list[str] | None = None
         # Record of the prior data for the model's file.
         self._prior_of: dict[str, Any] | None = None
         #: Gradient steps planned, for ``learning_rate_schedule``; None until known.
@@ -216,6 +219,7 @@ class SAC(  # type: ignore[misc]  # actor
             super()._setup_model()
         assert self.replay_buffer is not None
         store_float_actions(self.replay_buffer)
+        self._take_tasks(self.env)
         if self.compile != "auto":
             self.compiled = bool(self.compile)
         if self.prior_data is not None:
@@ -226,6 +230,14 @@ class SAC(  # type: ignore[misc]  # actor
         checks.check_sampling(self, self.replay_buffer)
         self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)
+
+    def _take_tasks(self, env: GymEnv | None) -> None:
+        """Record the tasks of an environment of several, and warn if the model has learned others."""
+        if not is_multi_task(self.observation_space) or (now := tasks_of(env)) is None:
+            return
+        if self.task_ids is not None and self.task_ids != now:
+            warn(f"env has the tasks {now}, numbered as those that this model has learned so far, {self.task_ids}")
+        self.task_ids = now
 
     def _take_prior_data(self, data: Dataset) -> None:
         """Record which data the prior data are, and warn if a loaded model had others."""
@@ -358,6 +370,7 @@ class SAC(  # type: ignore[misc]  # actor
                 f"prior_data: the model of {content.name} learned with {checks.prior_words(prior_of)}, which the file "
                 "does not hold: pass prior_data=, or prior_data=None to go on without"
             )
+        check_tasks(attributes.get("task_ids"), tasks_of(env))
         model = super()._made(content, attributes, kwargs, *args)
         scale = model.learner.reward_scaler
         if "reward_scale_kwargs" in kwargs and isinstance(scale, LinearScale) and scale.return_range is not None:
@@ -375,7 +388,8 @@ class SAC(  # type: ignore[misc]  # actor
 
         :param env: the environment, with the spaces and the number of environments that the model was made with
         :param force_reset: whether it is reset before training continues
-        :raises ValueError: if its spaces or its number of environments differ
+        :raises ValueError: if its spaces or its number of environments differ, or a task of ``multi_task_env`` has
+            another number
         """
         venv, is_first = self._wrap_env(env, self.verbose), self.env is None
         if not hasattr(self, "observation_space"):
@@ -384,7 +398,9 @@ class SAC(  # type: ignore[misc]  # actor
             self._setup_model()
         check_environment(venv, self.observation_space, self.action_space)
         checks.check_device_buffer(self, unwrap_vec_normalize(venv))
+        check_tasks(self.task_ids, tasks_of(venv))
         super().set_env(venv, force_reset)
+        self._take_tasks(venv)
         if is_first and self.seed is not None:
             # As if the environment had been a constructor argument.
             venv.seed(self.seed)
@@ -412,8 +428,12 @@ class SAC(  # type: ignore[misc]  # actor
         :return: actions, and ``state``
         :raises ValueError: if the observation is not one of the observation space, or there is no such task
         """
-        if is_multi_task(self.observation_space) and isinstance(observation, dict):
-            observation = told_task(self.observation_space, observation)  # type: ignore[arg-type]
+        space = self.observation_space
+        if isinstance(space, spaces.Dict) and isinstance(observation, (np.ndarray, list, torch.Tensor)):
+            keys = sorted(space.spaces)
+            raise ValueError(f"observation must be a dict with the keys {keys}, not a {type(observation).__name__}")
+        if is_multi_task(space) and isinstance(observation, dict):
+            observation = told_task(space, observation)  # type: ignore[arg-type]
         return super().predict(observation, state, episode_start, deterministic)
 
     def _sample_action(

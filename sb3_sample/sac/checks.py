@@ -449,8 +449,9 @@ def _check_no_spread(agent: Any) -> None:
         if isinstance(value, (str, type)) or value not in (None, 0, default_of(type(agent), name)):
             weighs.append(f"{name}={value!r}")
     if weighs:
+        instead = "another exploration" if len(weighs) == 1 and agent.exploration == "oac" else "a pessimism of 0"
         raise ValueError(
-            f"{weighs[-1]} weighs the critics' spread, which n_critics=1 has not: pass n_critics=2, or a pessimism of 0"
+            f"{weighs[-1]} weighs the critics' spread, which n_critics=1 has not: pass n_critics=2, or {instead}"
         )
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sample.envs.identities import identities
 from sb3_sample.faults import TrainingDiverged
-from sb3_sample.kinds import check_value, integer
+from sb3_sample.kinds import SEED, check_value, integer
 from sb3_sample.lockstep import Group, Seat
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
@@ -29,7 +29,6 @@ Agent = TypeVar("Agent", bound=SAC)
 
 #: Evaluations: episodes of each, and environment steps between two.
 EPISODES, EVAL_FREQ = 5, 10_000
-_SEED = integer(0, 2**32 - 1)
 
 
 def train_many(
@@ -213,7 +212,7 @@ def _checked_seeds(seeds: Any) -> list[int]:
         raise ValueError(f"seeds must be a list of seeds, one a learner, such as range(10), not {seeds!r}") from None
     if not found:
         raise ValueError("seeds must have at least one seed, one a learner, and is empty")
-    found = [check_value("each of seeds", seed, _SEED) for seed in found]
+    found = [check_value("each of seeds", seed, SEED) for seed in found]
     if twice := [seed for seed in dict.fromkeys(found) if found.count(seed) > 1]:
         raise ValueError(f"seeds must differ, one a learner, but has {', '.join(map(str, twice))} more than once")
     return found

@@ -449,9 +449,17 @@ def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
             f"normalize_observations=True is not for images, which are divided by 255 (observations {space}): pass "
             "normalize_observations=False"
         )
+    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
+    vectors = [key for key, part in parts.items() if isinstance(part, spaces.Box) and not is_image_space(part)]
+    instead = (
+        f", and the environment in a VecNormalize with norm_obs_keys={vectors} (and with a reward_scale, "
+        "norm_reward=False)"
+        if vectors
+        else ""
+    )
     raise ValueError(
         f"normalize_observations=True needs observations of a Box of floats, not of {space}: pass "
-        "normalize_observations=False, and the environment in a VecNormalize (with a reward_scale, norm_reward=False)"
+        f"normalize_observations=False{instead}"
     )
 
 

@@ -11,13 +11,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_learn, check_n_envs
+from sb3_sample.arguments import OF_BUFFER, check_kwargs, check_learn, check_n_envs
 from sb3_sample.constructor import Constructed, argument
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
 from sb3_sample.faults import check_finite_parameters
-from sb3_sample.kinds import DICT, VERBOSE, Kind, integer
+from sb3_sample.kinds import DICT, SEED, VERBOSE, Kind, integer
 from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.model_tree import Description
@@ -46,8 +46,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
     """arguments of the policy"""
     verbose: int = argument(default=0, kind=VERBOSE)
     """0 nothing, 1 info, 2 debug"""
-    # NumPy takes these seeds.
-    seed: int | None = argument(default=None, kind=integer(0, 2**32 - 1).or_none())
+    seed: int | None = argument(default=None, kind=SEED.or_none())
     """seed of everything random"""
     _device: torch.device | str = argument(alias="device", default="auto")
     """"auto", "cpu", "cuda", ..."""
@@ -83,6 +82,8 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         given: dict[str, Any] = {name: vars(self)[name] for name in names if name in vars(self)}
         # Policy and buffer are built with more than the user's own arguments, and only the latter are saved.
         self._complete_arguments()
+        if isinstance(buffer := vars(self).get("replay_buffer_class"), type):
+            check_kwargs("replay_buffer_kwargs", given["replay_buffer_kwargs"] or {}, buffer, OF_BUFFER)
         try:
             super()._setup_model()  # type: ignore[safe-super]  # of Stable-Baselines3's algorithm
         finally:

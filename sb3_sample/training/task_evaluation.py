@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,10 +61,13 @@ def evaluate_tasks(
     :param render: whether the environments are drawn
     :param warn: whether to warn of a missing ``Monitor``
     :return: evaluations by the task's id, in the order of the tasks
-    :raises ValueError: if ``env`` is not of several tasks, or another argument is out of range
+    :raises ValueError: if ``env`` is not of several tasks, a task has another number than the model has learned, or
+        another argument is out of range
     """
     check_value("n_eval_episodes", n_eval_episodes, integer(1))
-    found = {task_id: TaskEvaluation([], [], []) for task_id in task_ids("env", env)}
+    ids = task_ids("env", env)
+    check_tasks(getattr(model, "task_ids", None), ids)
+    found = {task_id: TaskEvaluation([], [], []) for task_id in ids}
     of_env = list(found.values())
 
     def take(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -97,10 +101,41 @@ def task_ids(name: str, env: Any) -> list[str]:
     :return: ids of its tasks, in their order
     :raises ValueError: if it is not of several tasks
     """
+    ids = tasks_of(env)
+    if ids is None:
+        raise ValueError(f"{name} must be of multi_task_env, whose environments have a task_id, not {env!r}")
+    return ids
+
+
+def tasks_of(env: Any) -> list[str] | None:
+    """
+    :param env: an environment
+    :return: ids of its tasks, in their order; None if it is not of several tasks
+    """
     # has_attr comes first, since a worker of SubprocVecEnv dies if asked for an attribute that does not exist.
     if not (hasattr(env, "has_attr") and env.has_attr("task_id")):
-        raise ValueError(f"{name} must be of multi_task_env, whose environments have a task_id, not {env!r}")
+        return None
     return [str(task_id) for task_id in env.get_attr("task_id")]
+
+
+def check_tasks(before: Any, now: Sequence[str] | None, name: str = "env") -> None:
+    """
+    Check that tasks of an environment have the numbers by which a model has learned them. Other tasks may have any.
+
+    :param before: ids of the model's, in the order of their numbers, perhaps a file's; None if it has none
+    :param now: likewise, of the environment
+    :param name: name of the argument that has the environment, for the error
+    :raises ValueError: if a task had another number
+    """
+    if before is None:
+        return
+    if not isinstance(before, list) or not all(isinstance(each, str) for each in before):
+        raise ValueError(f"task_ids cannot be {before!r:.100}")
+    if moved := [each for i, each in enumerate(now or ()) if each in before and before.index(each) != i]:
+        raise ValueError(
+            f"{name} must have the model's tasks in their order, {before}, not {now}: a task's number tells the model "
+            f"which it is, and that of {moved[0]!r} was {before.index(moved[0])}"
+        )
 
 
 class MultiTaskEvalCallback(EvalCallback):
@@ -188,6 +223,7 @@ class MultiTaskEvalCallback(EvalCallback):
             ours, theirs = getattr(self.model, name), getattr(self.eval_env, name)
             if ours != theirs:
                 raise ValueError(f"eval_env has the {name} {theirs}, but the model has {ours}")
+        check_tasks(getattr(self.model, "task_ids", None), self.task_ids, "eval_env")
         super()._init_callback()
 
     def _on_training_start(self) -> None:

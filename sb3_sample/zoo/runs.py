@@ -14,6 +14,7 @@ import functools
 import json
 import os
 import re
+import shutil
 import sys
 import traceback
 import warnings
@@ -343,7 +344,10 @@ def _check_agent(arguments: Sequence[str]) -> None:
     parser.add_argument("-i", "--trained-agent", default="")
     agent = parser.parse_known_args(arguments)[0].trained_agent
     if agent and not (agent.endswith(".zip") and os.path.isfile(agent)):
-        raise RunError(f"-i must be a .zip file of a model, not {agent!r}")
+        is_missing = agent.endswith(".zip") and not os.path.exists(agent)
+        raise RunError(
+            f"-i must be a .zip file of a model, not {agent!r}" + (", which is not there" if is_missing else "")
+        )
 
 
 def _latest(arguments: Sequence[str]) -> Path:
@@ -519,6 +523,16 @@ class Manager(ExperimentManager):
         self._of_trial: set[str] = set()
         # Settings of the model that is trained on, for those who read the run's.
         self._of_agent: dict[str, Any] = {}
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        was_there = os.path.exists(self.save_path)
+        try:
+            return super().setup_experiment()  # type: ignore[no-any-return]
+        except BaseException:
+            # ``enjoy`` would take the folder of a refused run for the latest one.
+            if not was_there:
+                shutil.rmtree(self.save_path, ignore_errors=True)
+            raise
 
     def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         found: dict[str, Any] = super().load_trial(*args, **kwargs)

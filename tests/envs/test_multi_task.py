@@ -166,6 +166,12 @@ def test_refused(ids: Any, words: str) -> None:
         multi_task_env(ids)
 
 
+@pytest.mark.parametrize("seed", ["a", 1.5, -1, 2**32])
+def test_seeds_are_checked(seed: Any) -> None:
+    with pytest.raises(ValueError, match=f"seed must be an integer of at least 0 .*, or None, not {seed!r}"):
+        multi_task_env([PENDULUM], seed=seed)
+
+
 def test_dict_observations_are_refused() -> None:
     class Goal(gym.Env):
         observation_space = spaces.Dict({"observation": spaces.Box(-1, 1, (2,)), "desired_goal": spaces.Box(-1, 1)})

@@ -14,7 +14,7 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from sb3_sample import BRO, DAC, SAC, Dataset
+from sb3_sample import BRO, DAC, SAC, Dataset, FadedReplayBuffer
 from sb3_sample.learner import first_step
 from sb3_sample.parts import (
     Batch,
@@ -481,6 +481,26 @@ class Head(ValueHead):
         (
             {"policy_kwargs": {"qqq": 1}},
             "policy_kwargs has 'qqq', which is no argument of SACPolicy. It takes ['activation_fn', 'actor_features',",
+        ),
+        (
+            {"policy_kwargs": {"optimizer_kwargs": {"weight_dcay": 1}}},
+            "policy_kwargs['optimizer_kwargs'] has 'weight_dcay', which is no argument of AdamW. Did you mean 'weight_",
+        ),
+        (
+            {"policy_kwargs": {"optimizer_class": torch.optim.SGD, "optimizer_kwargs": {"lr": 1}}},
+            "policy_kwargs['optimizer_kwargs'] has 'lr', which follows from learning_rate: pass that instead",
+        ),
+        (
+            {"replay_buffer_kwargs": {"fade": 1}},
+            "replay_buffer_kwargs has 'fade', which is no argument of CompactReplayBuffer. It takes ['frame_stack', '",
+        ),
+        (
+            {"replay_buffer_class": FadedReplayBuffer, "replay_buffer_kwargs": {"fades": 1}},
+            "replay_buffer_kwargs has 'fades', which is no argument of FadedReplayBuffer. Did you mean 'fade'?",
+        ),
+        (
+            {"replay_buffer_kwargs": {"buffer_size": 5}},
+            "replay_buffer_kwargs has 'buffer_size', which follows from buffer_size: pass that instead",
         ),
         (
             {"pessimism_kwargs": {"a": 1}},

@@ -558,6 +558,11 @@ def test_a_regularization_is_not_switched_off(kwargs: dict[str, Any], named: str
         sac(cls=RegularizedSAC, policy_kwargs=policy_kwargs, **kwargs)
 
 
+def test_exploration_by_the_spread_of_one_critic() -> None:
+    with pytest.raises(ValueError, match="exploration='oac' .* pass n_critics=2, or another exploration"):
+        MAKERS["SimBa"](n_critics=1, pessimism=0, exploration="oac")
+
+
 @pytest.mark.parametrize("kwargs", [{"cls": GPLSAC}, {"cls": OAC}, {"pessimism": "top"}])
 def test_no_spread_of_one_critic(kwargs: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="n_critics=1"):

@@ -406,6 +406,8 @@ def test_predict_is_told_the_task() -> None:
             model.predict(told(task))
     with pytest.raises(ValueError, match=r"entries 'observation' and 'task', not \['observation'\]"):
         model.predict({"observation": told(0)["observation"]})
+    with pytest.raises(ValueError, match=r"must be a dict with the keys \['observation', 'task'\], not a ndarray"):
+        model.predict(told(0)["observation"])
 
 
 class FromFive(gym.ObservationWrapper):
@@ -453,6 +455,32 @@ def test_one_model_is_saved_and_loaded(tmp_path: Path) -> None:
         assert np.array_equal(alone.predict(told(task), deterministic=True)[0], expected)
     bro(tasks(), policy="MultiInputPolicy", multitask=True).learn(30).save(tmp_path / "bro")
     assert BRO.load(tmp_path / "bro").critic.trunk.out_features == 16
+
+
+def test_tasks_keep_their_numbers(tmp_path: Path) -> None:
+    """Spaces are the same in another order, and each task would have the other's embedding, one-hot and scale."""
+    model = make("BRC").learn(20)
+    model.save(tmp_path / "model")
+    assert model.task_ids == [PENDULUM, CAR]
+    words = rf"must have the model's tasks in their order, \['{PENDULUM}', '{CAR}'\], not \['{CAR}', '{PENDULUM}'\]"
+    with pytest.raises(ValueError, match=f"^env {words}.*'{CAR}' was 1"):
+        BRC.load(tmp_path / "model", env=tasks(CAR, PENDULUM))
+    loaded = BRC.load(tmp_path / "model")
+    for refused in (model.set_env, loaded.set_env, lambda env: evaluate_tasks(model, env)):
+        with pytest.raises(ValueError, match=f"^env {words}"):
+            refused(tasks(CAR, PENDULUM))
+    with pytest.raises(ValueError, match=f"^eval_env {words}"):
+        model.learn(2, callback=MultiTaskEvalCallback(tasks(CAR, PENDULUM)))
+    loaded.set_env(tasks())
+    other = "Pendulum-v1000"
+    gym.register(other, "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=8)
+    try:
+        with pytest.warns(UserWarning, match=rf"env has the tasks \['{other}', '{CAR}'\], numbered as those that"):
+            loaded = BRC.load(tmp_path / "model", env=tasks(other, CAR))
+    finally:
+        del gym.registry[other]
+    assert loaded.task_ids == [other, CAR]
+    assert sac().task_ids is None
 
 
 @pytest.mark.parametrize("name", ["BRC", "BRO", "VPLSAC"])
