@@ -308,11 +308,12 @@ class TaskScale(RewardScale):
         return self.divisors[task]
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {"episodes": [list(episode) for episode in self._episodes], "has_looked": self._has_looked}
+        return {"episodes": [list(episode) for episode in self._episodes]}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._episodes = [list(episode) for episode in state["episodes"]]
-        self._has_looked = state.get("has_looked", False)  # absent from older files
+        # The buffers are loaded before. Once every task has finished an episode there is nothing to warn of.
+        self._has_looked = not bool(self.largest.isinf().any())
 
 
 def _bound(learner: Learning, max_return: float | None, otherwise: float) -> float:

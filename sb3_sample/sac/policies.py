@@ -449,17 +449,13 @@ def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
             f"normalize_observations=True is not for images, which are divided by 255 (observations {space}): pass "
             "normalize_observations=False"
         )
-    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
+    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
     vectors = [key for key, part in parts.items() if isinstance(part, spaces.Box) and not is_image_space(part)]
-    instead = (
-        f", and the environment in a VecNormalize with norm_obs_keys={vectors} (and with a reward_scale, "
-        "norm_reward=False)"
-        if vectors
-        else ""
-    )
+    keys = f", norm_obs_keys={vectors}" if isinstance(space, spaces.Dict) else ""
+    wrapped = f", and the environment in VecNormalize(env{keys}), norm_reward=False with a reward_scale"
     raise ValueError(
         f"normalize_observations=True needs observations of a Box of floats, not of {space}: pass "
-        f"normalize_observations=False{instead}"
+        f"normalize_observations=False{wrapped if vectors else ''}"
     )
 
 

@@ -691,7 +691,16 @@ def test_validation_goes_with_tasks() -> None:
         ("SAC", {"policy_kwargs": {"width_factor": 2}}, "width_factor is an argument of the algorithm"),
         ("SAC", {"policy": "CnnPolicy"}, "CnnPolicy"),
         ("SAC", {"n_steps": 3}, "n_steps=3 is not supported with Dict"),
-        ("SimBa", {"env": vec(obs_space=GOALS)}, "normalize_observations=True needs observations of a Box of floats"),
+        (
+            "SimBa",
+            {"env": vec(obs_space=GOALS)},
+            r"needs observations of a Box of floats, .*VecNormalize\(env, norm_obs_keys=\['goal', 'observation'\]\)",
+        ),
+        (
+            "SimBa",
+            {"env": vec(obs_space=spaces.Discrete(3)), "policy": "MlpPolicy"},
+            r"needs observations of a Box of floats, not of Discrete\(3\): pass normalize_observations=False$",
+        ),
     ],
 )
 def test_refused(name: str, kwargs: dict[str, Any], words: str) -> None:
