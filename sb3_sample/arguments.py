@@ -93,7 +93,7 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
         if name in kwargs:
             check_value(f"policy_kwargs[{name!r}]", kwargs[name], kind)
     check_kwargs("policy_kwargs", kwargs, agent.policy_class, _OF_POLICY)
-    optimizer = kwargs.get("optimizer_class") or _default_optimizer(agent.policy_class)
+    optimizer = kwargs.get("optimizer_class") or default_of(agent.policy_class, "optimizer_class")
     if isinstance(optimizer, type):
         of_optimizer = kwargs.get("optimizer_kwargs") or {}
         check_kwargs("policy_kwargs['optimizer_kwargs']", of_optimizer, optimizer, _OF_OPTIMIZER)
@@ -111,16 +111,6 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
             "policy='CnnPolicy' needs images, of integers in [0, 255] (with policy_kwargs={'normalize_images': False} "
             f"of any numbers), not {space}: use 'MlpPolicy' for vectors"
         )
-
-
-def _default_optimizer(policy: type) -> Any:
-    """Default of ``optimizer_class``, which a derived policy may pass on as ``**kwargs``."""
-    for base in policy.__mro__:
-        if "__init__" in vars(base):
-            parameter = inspect.signature(vars(base)["__init__"]).parameters.get("optimizer_class")
-            if parameter is not None:
-                return parameter.default
-    return None
 
 
 def _check_schedule(name: str, schedule: Callable[[float], Any]) -> None:
