@@ -103,16 +103,17 @@ def _set_command_line(command: str, arguments: list[str]) -> None:
 
 def _train(arguments: list[str]) -> None:
     _zoo_module("rl_zoo3.train")
-    from sb3_sample.zoo import runs
+    from sb3_sample.zoo import train
     from sb3_sample.zoo.patches import reading
+    from sb3_sample.zoo.runs import Data
 
-    options, rest = _own_options(runs.train_parser(), arguments)
+    options, rest = _own_options(train.train_parser(), arguments)
     with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
         if options.seeds is not None:
-            runs.train_seeds(options, rest)
+            train.train_seeds(options, rest)
         else:
-            data = runs.Data.of(options)
-            runs.train(runs.plan(options, rest), rest, data)
+            data = Data.of(options)
+            train.train(train.plan(options, rest), rest, data)
 
 
 def _enjoy(arguments: list[str]) -> None:

@@ -18,7 +18,7 @@ from rl_zoo3 import ALGOS
 
 from sb3_sample import cli, make_env, zoo
 from sb3_sample.zoo.patches import models_checked
-from sb3_sample.zoo.runs import Record
+from sb3_sample.zoo.records import Record
 from tests.test_zoo_runs import check_equal, outcome, steps
 
 zoo.register()

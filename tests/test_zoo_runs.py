@@ -29,7 +29,9 @@ from sb3_sample.run_logs import read_monitors
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
 from sb3_sample.zoo.files import RunError
-from sb3_sample.zoo.runs import Data, Manager, Record, RunFiles, plan, train_parser
+from sb3_sample.zoo.records import Record
+from sb3_sample.zoo.runs import Data, Manager, RunFiles
+from sb3_sample.zoo.train import plan, train_parser
 from sb3_sample.zoo.watch import model_path
 
 zoo.register()

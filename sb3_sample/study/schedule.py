@@ -284,7 +284,7 @@ class Process:
 
 def _batches(runs: Sequence[Run]) -> list[tuple[Run, ...]]:
     """Group runs that differ only in their seed, if they can be made together; in the order of the first of each."""
-    from sb3_sample.zoo.runs import can_train_together
+    from sb3_sample.zoo.train import can_train_together
 
     found: dict[str, list[Run]] = {}
     for run in runs:

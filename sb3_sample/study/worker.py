@@ -53,18 +53,19 @@ def training() -> Iterator[Train]:
     :return: function that makes a run like ``sb3-sample train``. Trainings in lockstep call it concurrently
     """
     from sb3_sample import zoo
-    from sb3_sample.zoo import runs
+    from sb3_sample.zoo import train as command
     from sb3_sample.zoo.patches import reading
+    from sb3_sample.zoo.runs import Data
 
     zoo.register()
 
     def make(run: Run, folder: Path, options: list[str]) -> None:
-        given, rest = runs.train_parser().parse_known_args([*run.command(folder), *options])
-        start = runs.plan(given, rest)
+        given, rest = command.train_parser().parse_known_args([*run.command(folder), *options])
+        start = command.plan(given, rest)
         assert start is not None
-        train_in_zoo(start, start.arguments, runs.Data.of(given))
+        train_in_zoo(start, start.arguments, Data.of(given))
 
-    with reading(), runs.training() as train_in_zoo:
+    with reading(), command.training() as train_in_zoo:
         yield make
 
 

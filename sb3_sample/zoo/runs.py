@@ -1,29 +1,20 @@
 """
-Runs of ``sb3-sample train`` that resume where they were interrupted (``--run-dir``, ``--checkpoint-freq``,
-``--resume``), and runs that learn from data (``--dataset``, ``--offline-steps``, ``--prior-data``).
-
-Besides the checkpoints and the zoo's files, the folder of a run with checkpoints has a record ``run.json`` of how it
-was started. A run that learns from data first and then in its environment has the checkpoints of the first part in
-``offline``.
+Managers of the runs of ``sb3-sample train``, in the place of the zoo's: runs that resume where they were interrupted,
+and runs that learn from data (``--dataset``, ``--offline-steps``, ``--prior-data``).
 """
 
 import argparse
 import contextlib
 import difflib
-import functools
-import json
 import os
 import re
 import shutil
-import sys
-import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import rl_zoo3.exp_manager
-import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -37,31 +28,19 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs.atari import AtariFrames
 from sb3_sample.envs.registration import check_game, is_atari_id
-from sb3_sample.lockstep import Seat, present
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.reading import read_dataset
-from sb3_sample.run_logs import OFFLINE, monitor_files, monitor_head
-from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.many import train_together
-from sb3_sample.saving.container import replacing
+from sb3_sample.run_logs import OFFLINE
 from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.normalization import lacks_vec_normalize
-from sb3_sample.saving.temporary import is_temporary
 from sb3_sample.saving.training_state import argument_names
-from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.training.seats import all_made
 from sb3_sample.warn import warn
 from sb3_sample.zoo.algorithms import ALGORITHMS
-from sb3_sample.zoo.files import RunError, add_trust
-from sb3_sample.zoo.patches import managed_by, monitors_go_on
+from sb3_sample.zoo.files import RunError
+from sb3_sample.zoo.patches import monitors_go_on
+from sb3_sample.zoo.records import Record, checkpoints
 
-RECORD = "run.json"
-#: Largest size of a record, in bytes.
-MAX_RECORD = 2**18
-#: Endings of the files that a run writes.
-SUFFIXES = (".csv", ".json", ".jsonl", ".npz", ".yml", ".zip")
-#: Environment steps between two checkpoints.
-CHECKPOINT_FREQ = 10_000
 #: Arguments of the zoo that identify a run, besides its hyperparameters. Its length, its device and its output may
 #: change.
 COMPARED = (
@@ -74,86 +53,6 @@ _OF_NOISE = {"noise_type", "noise_std"}
 _OF_STATISTICS = {"normalize"}
 #: Arguments that the zoo's options set.
 _OF_OPTIONS = {"env", "seed", "verbose", "device", "tensorboard_log"}
-
-
-class Record(NamedTuple):
-    """
-    How a run was started.
-
-    :param algo: name of its algorithm
-    :param env: id of its environment
-    :param seed: its seed, which the zoo draws if none is given
-    :param n_timesteps: ``-n``, or -1 if it was not given
-    :param checkpoint_freq: environment steps between two checkpoints
-    :param settings: arguments and hyperparameters by name, as Python writes them; only compared, never evaluated
-    :param tensorboard: folder of its TensorBoard log, if it has one
-    """
-
-    algo: str
-    env: str
-    seed: int
-    n_timesteps: int
-    checkpoint_freq: int
-    settings: dict[str, str]
-    tensorboard: str | None = None
-
-    def write(self, folder: Path) -> None:
-        """
-        :param folder: the run's folder
-        :raises OSError: it cannot be written; one that was there is unchanged then
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(folder / RECORD) as file:
-            file.write(json.dumps(self._asdict(), indent=1).encode())
-
-    @classmethod
-    def read(cls, folder: Path) -> "Record":
-        """
-        :param folder: the run's folder
-        :return: its record
-        :raises RunError: there is none, or it is no such record
-        """
-        path = folder / RECORD
-        try:
-            found = parse_json(read_regular(path, MAX_RECORD), "it")
-        except FileNotFoundError as error:
-            raise RunError(f"{folder} is no folder of a run of sb3-sample train: it has no {RECORD}") from error
-        except (OSError, BadFile) as error:
-            raise RunError(f"{path} is not what sb3-sample train has written: {error}") from error
-        if not isinstance(found, dict) or not cls._field_defaults.keys() | found.keys() == set(cls._fields):
-            raise RunError(f"{path} is not what sb3-sample train has written: it has other entries")
-        record = cls(**found)
-        for name, value in record._asdict().items():
-            if not _RECORDED[name](value):
-                raise RunError(
-                    f"{path} is not what sb3-sample train has written: a value is of the wrong kind, {name} is "
-                    f"{value!r:.100}"
-                )
-        return record
-
-
-def _is_id(value: Any) -> bool:
-    return isinstance(value, str) and re.fullmatch(r"\w[\w:./-]{0,200}", value) is not None
-
-
-def _is_within(low: int, high: int) -> Callable[[Any], bool]:
-    return lambda value: type(value) is int and low <= value < high
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
-
-
-#: Checks of the entries of a record.
-_RECORDED: dict[str, Callable[[Any], bool]] = {
-    "algo": _is_id,
-    "env": _is_id,
-    "seed": _is_within(0, 2**32),
-    "n_timesteps": _is_within(-1, 2**53),
-    "checkpoint_freq": _is_within(1, 2**53),
-    "settings": _are_texts,
-    "tensorboard": lambda value: value is None or isinstance(value, str),
-}
 
 
 class Data(NamedTuple):
@@ -198,305 +97,6 @@ class Start(NamedTuple):
     checkpoint_freq: int
     folder: Path | None = None
     record: Record | None = None
-
-
-def check_entries(folder: Path) -> None:
-    """
-    :param folder: a run's folder
-    :raises RunError: an entry of it, or of a folder in it, is a link, by which the run would write elsewhere; or a pipe
-        or a device, which may never end; or a folder with the name of a file
-    """
-    for path in (*folder.glob("*"), *folder.glob("*/*")):
-        if path.is_symlink():
-            raise RunError(
-                f"{path} is a link, and a run follows none in its folder (the folder itself may be one): remove it, or "
-                "name another --run-dir"
-            )
-        is_folder = path.is_dir() and path.suffix not in SUFFIXES
-        if not (path.is_file() or is_folder):
-            raise RunError(f"{path} is no file, where a run has one: remove it, or name another --run-dir")
-
-
-def check_monitor_files(folder: Path) -> None:
-    """
-    :param folder: folder of a run that resumes
-    :raises RunError: a file that Monitor would append to is no file of Monitor's
-    """
-    for path in monitor_files(folder):
-        try:
-            monitor_head(path)
-        except (OSError, BadFile) as error:
-            raise RunError(f"{error}. The run would append to {path}: remove it, and a new one is begun") from error
-
-
-def checkpoints(folder: Path) -> list[Path]:
-    """
-    :param folder: a run's folder
-    :return: the folders of its checkpoints, oldest first; the checkpoints are not opened
-    """
-    return sorted(path for path in folder.glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d{12,}", path.name))
-
-
-def all_checkpoints(folder: Path) -> list[Path]:
-    """
-    :param folder: a run's folder
-    :return: as ``checkpoints``, those of the steps on a data set first
-    """
-    return [*checkpoints(folder / OFFLINE), *checkpoints(folder)]
-
-
-def train_parser() -> argparse.ArgumentParser:
-    """
-    :return: parser of the options that ``train`` takes besides the zoo's
-    """
-    parser = argparse.ArgumentParser("sb3-sample train", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False)
-    group = parser.add_argument_group("runs that go on where they were interrupted (our algorithms)")
-    group.add_argument(
-        "--run-dir",
-        type=Path,
-        metavar="DIR",
-        help="Folder of this run, with checkpoints. The same command, given again, goes on with it",
-    )
-    group.add_argument(
-        "--checkpoint-freq",
-        type=int,
-        metavar="N",
-        help=f"Environment steps between two checkpoints (default: {CHECKPOINT_FREQ}). Without --run-dir the run gets "
-        "a new folder below the log folder, as without checkpoints",
-    )
-    group.add_argument(
-        "--resume",
-        action="store_true",
-        help="Go on, with the same arguments as before, with the run in --run-dir, or else with the run of --algo, "
-        "--env and --seed (if given) below the log folder that has the latest checkpoint; an error if there is none",
-    )
-    group = parser.add_argument_group("many seeds in one process (our off-policy algorithms)")
-    group.add_argument(
-        "--seeds",
-        type=int,
-        nargs="+",
-        metavar="N",
-        help="How many seeds, from 0 on, or several seeds by name: a run of each, with a folder of its own, as by as "
-        "many commands with --seed; --run-dir then has the folders seed-0, seed-1 and so on (docs/many_learners.md)",
-    )
-    group = parser.add_argument_group("data that are there already (the family of SAC; --dataset not dr_q)")
-    group.add_argument(
-        "--dataset",
-        metavar="PATH",
-        help="Learn from a data set, -n gradient steps: a folder or an id of Minari's, or an HDF5 file in D4RL's "
-        "layout. The environment is for evaluations then",
-    )
-    group.add_argument(
-        "--offline-steps",
-        type=int,
-        metavar="N",
-        help="With --dataset: so many of the -n steps are gradient steps on it, the rest is learned in the environment",
-    )
-    group.add_argument(
-        "--prior-data",
-        metavar="PATH",
-        help="Data set that a share of every batch is taken from while learning in the environment (prior_share, 0.5)",
-    )
-    add_trust(parser.add_argument_group("files that run no code (our algorithms)"))
-    return parser
-
-
-def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
-    """
-    :param options: what ``train_parser`` has parsed
-    :param arguments: the rest of the command line
-    :return: how the run starts; None for one without checkpoints
-    :raises RunError: if it cannot
-    """
-    _check_agent(arguments)
-    if options.run_dir is None and options.checkpoint_freq is None and not options.resume:
-        return None
-    freq = options.checkpoint_freq
-    if freq is not None and freq < 1:
-        raise RunError(f"--checkpoint-freq must be at least 1, in environment steps, not {freq}")
-    folder = options.run_dir
-    if folder is None:
-        if not options.resume:
-            return Start(list(arguments), freq)
-        folder = _latest(arguments)
-    for each in folder, folder / OFFLINE:
-        check_entries(each)
-    if not all_checkpoints(folder):
-        if options.resume:
-            raise RunError(f"--resume: {folder} has no checkpoint to go on from")
-        # A run that was interrupted before its first checkpoint has its record, or a part of it.
-        is_empty = folder.is_dir() and all(is_temporary(path.name) for path in folder.iterdir())
-        if folder.exists() and not (is_empty or (folder / RECORD).exists()):
-            raise RunError(
-                f"--run-dir {folder} holds files, but no run with checkpoints: it must be the folder of such a run, an "
-                "empty one or none"
-            )
-        return Start(list(arguments), freq or CHECKPOINT_FREQ, folder)
-    record = Record.read(folder)
-    check_monitor_files(folder)
-    # Further arguments of the command line replace these.
-    command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
-    return Start(command, freq or record.checkpoint_freq, folder, record)
-
-
-def _check_agent(arguments: Sequence[str]) -> None:
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("-i", "--trained-agent", default="")
-    agent = parser.parse_known_args(arguments)[0].trained_agent
-    if agent and not (agent.endswith(".zip") and os.path.isfile(agent)):
-        is_missing = agent.endswith(".zip") and not os.path.exists(agent)
-        raise RunError(
-            f"-i must be a .zip file of a model, not {agent!r}" + (", which is not there" if is_missing else "")
-        )
-
-
-def _latest(arguments: Sequence[str]) -> Path:
-    """
-    The run with the latest checkpoint, among those of a command line's algorithm, environment and, if given, seed.
-    """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo")
-    parser.add_argument("--env")
-    parser.add_argument("--seed", type=int, default=-1)
-    parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"))
-    asked = parser.parse_known_args(arguments)[0]
-    if asked.algo is None or asked.env is None:
-        raise RunError("--resume needs --run-dir, or --algo and --env, to know which run to go on with")
-    is_given = asked.seed >= 0  # otherwise the zoo draws one
-    found = []
-    for file in asked.log_folder.rglob(RECORD):
-        made = all_checkpoints(file.parent)
-        with contextlib.suppress(RunError):  # some other program's file of that name
-            record = Record.read(file.parent)
-            of_seed = not is_given or record.seed == asked.seed
-            if made and of_seed and (record.algo, record.env) == (asked.algo, asked.env):
-                found.append((made[-1].stat().st_mtime, file.parent))
-    if not found:
-        raise RunError(
-            f"--resume: no run of {asked.algo} on {asked.env}{f' with seed {asked.seed}' if is_given else ''} below "
-            f"{asked.log_folder} has a checkpoint. Runs have checkpoints if they are started with --run-dir or "
-            "--checkpoint-freq"
-        )
-    return max(found)[1]
-
-
-@contextlib.contextmanager
-def training() -> Iterator[Callable[[Start | None, Sequence[str], Data], None]]:
-    """
-    Let the zoo's ``train`` make our runs.
-
-    :return: a function that makes a run. Its arguments are how the run starts (None for one without checkpoints), the
-        command line for the zoo, without our options, and the data sets that it learns from. Trainings in lockstep call
-        it at the same time
-    """
-    starts: dict[Seat | None, tuple[Start | None, Data]] = {}
-
-    def manager(*positional: Any, **named: Any) -> Manager:
-        start, data = starts[present()]
-        return Manager(data, *positional, **named) if start is None else RunManager(start, data, *positional, **named)
-
-    def train(start: Start | None, arguments: Sequence[str], data: Data) -> None:
-        starts[present()] = start, data
-        # The zoo reads it at once.
-        sys.argv = ["sb3-sample train", *arguments]
-        rl_zoo3.train.train()
-
-    with managed_by(manager, rl_zoo3.train):
-        yield train
-
-
-def train(start: Start | None, arguments: Sequence[str], data: Data = Data()) -> None:  # noqa: B008  # immutable
-    """
-    Make a run as the zoo's ``train`` does.
-
-    :param start: how a run with checkpoints starts; None for one without
-    :param arguments: command line for the zoo, without our options, of a run without checkpoints
-    :param data: data sets that it learns from
-    :raises RunError: if it cannot start or resume in this way
-    :raises Refused: if an argument is not valid Python
-    :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the model
-    """
-    with training() as make:
-        make(start, arguments if start is None else start.arguments, data)
-
-
-def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
-    """
-    Make a run for each seed, all in this process, as separate commands would.
-
-    :param options: what ``train_parser`` has parsed, with ``seeds``
-    :param arguments: the rest of the command line
-    :raises RunError: if they cannot start or resume in this way
-    :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the models; a ``SystemExit`` after SIGTERM
-    :raises SystemExit: if a run has failed, after the end of the others
-    """
-    seeds, data = _seeds(options.seeds, arguments), Data.of(options)
-    if data.dataset is not None:
-        raise RunError(f"--dataset {data.dataset} does not go with --seeds: leave one of them out")
-    failed: dict[int, BaseException] = {}
-
-    def body(seed: int, start: Start | None, command: Sequence[str]) -> None:
-        try:
-            make(start, command, data)
-        except Exception as error:
-            seat = present()
-            assert seat is not None
-            if not seat.began:
-                raise
-            failed[seed] = error
-            print(f"The run of seed {seed} has failed, and the others go on:", file=sys.stderr)
-            traceback.print_exception(error)
-
-    seats = []
-    for seed in seeds:
-        folder = None if options.run_dir is None else options.run_dir / f"seed-{seed}"
-        command = [*arguments, "--seed", str(seed)]
-        start = plan(argparse.Namespace(**{**vars(options), "run_dir": folder}), command)
-        own = functools.partial(body, seed, start, command if start is None else start.arguments)
-        seats.append(Seat(f"the run of seed {seed}", own, start.folder if folder is None and start else folder))
-    saves = options.run_dir is not None or options.checkpoint_freq is not None or options.resume
-    with training() as make:
-        try:
-            train_together(seats, (options.run_dir or Path("logs")) if saves else None)
-        except KeyboardInterrupt as error:
-            on = f"the same command with --run-dir {options.run_dir} goes on" if options.run_dir else "all were saved"
-            raise KeyboardInterrupt(f"interrupted; {on}") from error
-    if failed:
-        words = "; ".join(f"seed {seed}: {type(error).__name__}: {error}" for seed, error in failed.items())
-        print(f"sb3-sample train: {len(failed)} of {len(seeds)} runs have failed: {words}", file=sys.stderr)
-        raise SystemExit(1)
-
-
-def _seeds(given: Sequence[int], arguments: Sequence[str]) -> list[int]:
-    """The seeds that ``--seeds`` asks for; refuses a command line that cannot be one of many."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo", default="ppo")
-    for option in ("--seed", "-optimize", "--optimize-hyperparameters", "--progress", "-P", "--track"):
-        parser.add_argument(option, dest=option, nargs="?", const=True)
-    asked = vars(parser.parse_known_args(arguments)[0])
-    if not can_train_together(algo := asked.pop("algo")):
-        names = ", ".join(name for name in ALGORITHMS if can_train_together(name))
-        raise RunError(f"--seeds is for the off-policy algorithms of this package, {names}, not --algo {algo}")
-    for option, value in asked.items():
-        if value is not None:
-            raise RunError(f"{option} does not go with --seeds: leave one of them out")
-    if len(given) == 1:
-        if given[0] < 1:
-            raise RunError(f"--seeds must be at least 1, if it is how many, not {given[0]}")
-        return list(range(given[0]))
-    if wrong := [seed for seed in given if not 0 <= seed < 2**32]:
-        raise RunError(f"a seed of --seeds must be at least 0 and below {2**32}, not {wrong[0]}")
-    if len(set(given)) < len(given):
-        raise RunError(f"--seeds must differ, not {' '.join(map(str, given))}")
-    return list(given)
-
-
-def can_train_together(algo: str) -> bool:
-    """
-    :param algo: name of an algorithm
-    :return: whether runs of several seeds can be made in one process
-    """
-    return algo in ALGORITHMS and issubclass(ALGORITHMS[algo].algorithm, SAC)
 
 
 class Manager(ExperimentManager):
@@ -886,7 +486,7 @@ class _Watched:
 class RunFiles(BaseCallback):
     """
     Cuts the Monitor files and the TensorBoard log back to the checkpoint from which a run resumes, since later entries
-    will be written again.
+    will be written again. Checkpoints name this class by its module.
 
     :param folder: the run's folder
     """

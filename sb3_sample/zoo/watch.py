@@ -30,7 +30,7 @@ from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import Refused, RunError, add_trust
 from sb3_sample.zoo.patches import make_answering_env, models_checked, reading, reading_settings, watched_with
-from sb3_sample.zoo.runs import Record, all_checkpoints
+from sb3_sample.zoo.records import Record, all_checkpoints
 from sb3_sample.zoo.settings import check_settings
 
 
