@@ -22,6 +22,7 @@ pytest.importorskip("rl_zoo3")
 
 import optuna
 from rl_zoo3 import ALGOS
+from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from sb3_sample import cli, zoo
@@ -257,6 +258,39 @@ def test_what_cannot_have_checkpoints_is_refused(run, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="-optimize has no checkpoints"):
         run("--run-dir", "a", "-optimize")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("checkpoints", [[], ["--checkpoint-freq", "40"]])
+def test_trainings_started_together_have_a_folder_each(
+    checkpoints: list[str], run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theirs = Path("logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip")
+    original = ExperimentManager.__init__
+
+    def started_together(self: Any, *args: Any, **kwargs: Any) -> None:
+        original(self, *args, **kwargs)
+        theirs.parent.mkdir(parents=True, exist_ok=True)
+        theirs.write_text("another run's")
+
+    monkeypatch.setattr(ExperimentManager, "__init__", started_together)
+    with pytest.raises(SystemExit, match="no hyperparameter"):
+        cli.main([*COMMAND, "-n", "60", *checkpoints, "-params", "learning_start:20"])
+    assert list(theirs.parent.parent.iterdir()) == [theirs.parent]
+    theirs.unlink()
+    theirs.parent.rmdir()
+    run("-n", "60", *checkpoints)
+    assert theirs.read_text() == "another run's" and list(theirs.parent.iterdir()) == [theirs]
+    ours = theirs.parent.with_name("Pendulum-v1_2")
+    assert {"Pendulum-v1.zip", "Pendulum-v1", "0.monitor.csv"} <= {path.name for path in ours.iterdir()}
+    assert (ours / "run.json").exists() == bool(steps(ours)) == bool(checkpoints)
+    assert (ours / "Pendulum-v1/config.yml").exists()
+
+
+def test_the_number_of_a_folder_in_one_whose_name_is_a_pattern(run) -> None:
+    # The zoo's look-up of the last number finds nothing there.
+    for _ in range(2):
+        run("-n", "60", "-f", "logs[1]")
+    assert {path.name for path in Path("logs[1]/sac_sample").iterdir()} == {"Pendulum-v1_1", "Pendulum-v1_2"}
 
 
 def test_a_search_without_a_completed_trial_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

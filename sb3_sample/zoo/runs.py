@@ -113,6 +113,10 @@ class Manager(ExperimentManager):
 
     #: Message for an interrupted run.
     _interrupted = "interrupted; the model was saved as it was"
+    #: Whether the run's folder is one that the zoo numbers.
+    _is_numbered = True
+    # Whether this run has made its folder.
+    _has_made_folder = False
 
     def __init__(self, data: Data, args: argparse.Namespace, *positional: Any, **named: Any):
         _check_data(data, args)
@@ -125,14 +129,30 @@ class Manager(ExperimentManager):
         self._of_agent: dict[str, Any] = {}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        was_there = os.path.exists(self.save_path)
         try:
             return super().setup_experiment()  # type: ignore[no-any-return]
         except BaseException:
             # ``enjoy`` would take the folder of a refused run for the latest one.
-            if not was_there:
+            if self._has_made_folder:
                 shutil.rmtree(self.save_path, ignore_errors=True)
             raise
+
+    def create_log_folder(self) -> None:
+        self._make_folder()
+        super().create_log_folder()
+
+    def _make_folder(self) -> None:
+        """Make the run's folder; a training started at the same time may have taken the number that the zoo chose."""
+        if self._has_made_folder:
+            return
+        try:
+            os.makedirs(self.save_path)
+        except FileExistsError:
+            if not self._is_numbered:
+                return
+            self.save_path = _make_numbered(self.log_path, self.env_name)
+            self.params_path = f"{self.save_path}/{self.env_name}"
+        self._has_made_folder = True
 
     def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         found: dict[str, Any] = super().load_trial(*args, **kwargs)
@@ -323,13 +343,18 @@ class RunManager(Manager):
             )
         super().__init__(data, args, *positional, **named)
         if start.folder is not None:
+            self._is_numbered = False
             self.save_path = str(start.folder)
             self.params_path = f"{self.save_path}/{self.env_name}"
-        self._start, self._folder = start, Path(self.save_path)
+        self._start = start
         # Our ``learn`` shows the progress bar, and leaves it out of the callbacks' state: a run's parts may or may not
         # have it.
         self._progress_bar, self.show_progress = self.show_progress, False
         self._record: Record
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self.save_path)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
@@ -342,6 +367,7 @@ class RunManager(Manager):
         before = self._start.record
         if before is not None:
             self._compare(spellings, before.settings)
+        self._make_folder()
         self._record = Record(
             algo=self.algo,
             env=self.env_name.gym_id,
@@ -375,10 +401,7 @@ class RunManager(Manager):
         is_ours = before and re.fullmatch(rf"{name}_\d+", Path(before).name)
         if before and is_ours and Path(before).parent == Path(str(self.tensorboard_log)):
             return before
-        new = f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
-        # Made at once, so that a run that is made beside this one gets another folder.
-        os.makedirs(new, exist_ok=True)
-        return new
+        return _make_numbered(str(self.tensorboard_log), name)
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -413,6 +436,17 @@ class RunManager(Manager):
             # This warning comes if a run was interrupted between the two parts.
             warnings.filterwarnings("ignore", "Nothing is left to train")
             super()._learn_first(model, dataset, gradient_steps, **{**arguments, "checkpoint": self._folder / OFFLINE})
+
+
+def _make_numbered(parent: str, name: str) -> str:
+    """Make a folder ``{name}_{number}``; others may make theirs at the same time."""
+    number = get_latest_run_id(parent, name)
+    while True:
+        number += 1
+        folder = os.path.join(parent, f"{name}_{number}")
+        with contextlib.suppress(FileExistsError):
+            os.makedirs(folder)
+            return folder
 
 
 def _spellings(name: str, value: Any) -> list[str]:
