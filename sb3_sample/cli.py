@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from sb3_sample.envs.base import select_gl_backend
-from sb3_sample.exits import interrupt, refuse
+from sb3_sample.exits import import_packages, interrupt, refuse
 from sb3_sample.extras import install, needing
 from sb3_sample.version import __version__
 
@@ -108,6 +108,7 @@ def _train(arguments: list[str]) -> None:
     from sb3_sample.zoo.runs import Data
 
     options, rest = _own_options(train.train_parser(), arguments)
+    _import_packages("train", rest)
     with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
         if options.seeds is not None:
             train.train_seeds(options, rest)
@@ -121,6 +122,7 @@ def _enjoy(arguments: list[str]) -> None:
     from sb3_sample.zoo import watch
 
     options, rest = _own_options(watch.watch_parser("enjoy"), arguments)
+    _import_packages("enjoy", rest)
     with _errors("enjoy"), watch.watching(options, rest, module) as command:
         _set_command_line("enjoy", command)
         module.enjoy()
@@ -131,6 +133,13 @@ def _own_options(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple
     if {"-h", "--help"} & set(arguments):
         print(parser.format_help())
     return parser.parse_known_args(arguments)
+
+
+def _import_packages(command: str, arguments: list[str]) -> None:
+    """Import what the zoo's command is about to import, which would end in a traceback."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    import_packages(command, parser.parse_known_args(arguments)[0].gym_packages)
 
 
 @contextlib.contextmanager
@@ -230,8 +239,7 @@ def _record_video(arguments: list[str]) -> None:
     parser = watch.watch_parser("record_video")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="Packages to import, as for enjoy")
     options, rest = _own_options(parser, arguments)
-    for package in options.gym_packages:
-        importlib.import_module(package)
+    import_packages("record_video", options.gym_packages)
     with _errors("record_video"), watch.watching(options, rest, utils) as command:
         _set_command_line("record_video", command)
         runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call

@@ -3,7 +3,6 @@
 import argparse
 import ast
 import contextlib
-import importlib
 import json
 import warnings
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_sample
 from sb3_sample.envs.registration import is_atari_id, register_atari
-from sb3_sample.exits import refuse
+from sb3_sample.exits import import_packages, refuse
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.dataset_files import minari_target
 from sb3_sample.replay.reading import HDF5, read_dataset
@@ -119,8 +118,7 @@ def _recorded(args: argparse.Namespace) -> Dataset:
         raise ValueError(f"model {args.model} is of {name}, none of this package's algorithms")
     model = cls.load(args.model, device="cpu")
     model.set_random_seed(args.seed)
-    for package in args.gym_packages:
-        importlib.import_module(package)
+    import_packages("dataset", args.gym_packages)
     if is_atari_id(args.env):
         register_atari()
     kwargs = dict(args.env_kwargs)

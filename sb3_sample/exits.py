@@ -1,6 +1,8 @@
-"""How ``sb3-sample`` ends when it refuses something, or is interrupted."""
+"""How ``sb3-sample`` ends when it refuses something, or is interrupted; packages that it is to import."""
 
+import importlib
 import sys
+from collections.abc import Iterable
 from typing import NoReturn
 
 #: The process's exit code, the same as after a wrong option.
@@ -31,6 +33,21 @@ def refuse(command: str, reason: object) -> NoReturn:
     :raises Refusal: always
     """
     raise Refusal(_say(command, reason))
+
+
+def import_packages(command: str, names: Iterable[str]) -> None:
+    """
+    Import the modules of ``--gym-packages``, which register environments.
+
+    :param command: name of the command
+    :param names: their names
+    :raises Refusal: if one cannot be imported
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            refuse(command, f"--gym-packages {name} cannot be imported: {error}")
 
 
 def interrupt(command: str, reason: object) -> NoReturn:

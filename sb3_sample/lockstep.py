@@ -119,6 +119,11 @@ class Seat:
         self.error: BaseException | None = None
 
     @property
+    def has_ended(self) -> bool:
+        """Whether its body has returned, or raised an error."""
+        return self.at is _ENDED
+
+    @property
     def with_others(self) -> bool:
         """Whether it takes gradient steps with others."""
         return self.takes_part and not self.alone
@@ -232,7 +237,9 @@ class Group:
                 pass
         except BaseException as error:
             self.stop = error
-            self._over.wait(PATIENCE)
+            # Those who interrupt are waited for, since the trainings may save what they have learned; a second
+            # interrupt ends this too.
+            self._over.wait(None if isinstance(error, (KeyboardInterrupt, SystemExit)) else PATIENCE)
             raise
         finally:
             before.put_back()

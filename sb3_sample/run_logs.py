@@ -3,11 +3,12 @@ Logs of a run, read for the plots and to resume it: ``evaluations.npz`` of ``Eva
 ``Monitor``. A run's folder may come from anybody: anything else is refused before it takes time or memory.
 """
 
+import contextlib
 import io
 import math
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -53,18 +54,35 @@ class Evaluations(dict[str, np.ndarray]):
         raise BadFile(f"{self.path} has no {key!r:.100}, but {', '.join(self)}")
 
 
+def has_ended(folder: Path) -> bool:
+    """
+    :param folder: a run's folder
+    :return: whether it has a final model that is not older than its checkpoints, as that of a run is which was ended
+        before and goes on
+    """
+    made = [*folder.glob("checkpoint-*"), *(folder / OFFLINE).glob("checkpoint-*")]
+    final = [path for path in folder.glob("*.zip") if not path.name.startswith(("best_model.", "rl_model_"))]
+    return bool(final) and max(_times(final), default=0) >= max(_times(made), default=0)
+
+
+def _times(paths: Iterable[Path]) -> Iterator[int]:
+    for path in paths:
+        # A run under way removes its old checkpoints.
+        with contextlib.suppress(FileNotFoundError):
+            yield path.stat().st_mtime_ns
+
+
 def is_truncated(folder: str | Path) -> bool:
     """
     :param folder: a run's folder
     :return: whether its evaluations are truncated because the run is under way, in which case the next evaluation
-        writes them anew: the run has checkpoints, and no final model
+        writes them anew: the run has checkpoints, and has not ended
     :raises BadFile: if they are a pipe or a device
     """
     folder = Path(folder)
     path = folder / EVALUATIONS
     has_checkpoint = any(folder.glob("checkpoint-*")) or (folder / OFFLINE).exists()
-    has_ended = any(not each.name.startswith(("best_model.", "rl_model_")) for each in folder.glob("*.zip"))
-    if not path.exists() or not has_checkpoint or has_ended:
+    if not path.exists() or not has_checkpoint or has_ended(folder):
         return False
     with open_regular(path) as file:
         start = file.read(len(_BEGINNING))

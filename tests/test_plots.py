@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -214,6 +215,11 @@ def test_a_run_that_has_just_begun_is_left_out(tmp_path: Path, capsys: pytest.Ca
     # One that is just writing its evaluations.
     (tmp_path / "sac/x_1/evaluations.npz").write_bytes(b"PK")
     (tmp_path / "sac/x_1/checkpoint-000000000000").mkdir()
+    plots.main([str(tmp_path), "-o", str(picture), "--published", "none"])
+    assert f"{tmp_path}/sac/x_1/evaluations.npz is just being written" in capsys.readouterr().err
+    # So is one that was interrupted before, and has a model of then.
+    (tmp_path / "sac/x_1/Pendulum-v1.zip").touch()
+    os.utime(tmp_path / "sac/x_1/Pendulum-v1.zip", (1, 1))
     plots.main([str(tmp_path), "-o", str(picture), "--published", "none"])
     assert f"{tmp_path}/sac/x_1/evaluations.npz is just being written" in capsys.readouterr().err
 

@@ -4,6 +4,7 @@ import argparse
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,9 +27,10 @@ from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from sb3_sample import cli, zoo
-from sb3_sample.run_logs import read_monitors
+from sb3_sample.run_logs import has_ended, read_monitors
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
+from sb3_sample.saving.locks import take_folder
 from sb3_sample.zoo.files import RunError
 from sb3_sample.zoo.records import Record
 from sb3_sample.zoo.runs import Data, Manager, RunFiles
@@ -308,6 +310,100 @@ def test_a_search_without_a_completed_trial_says_so(monkeypatch: pytest.MonkeyPa
         cli.main([*search, callback])
 
 
+def test_the_trials_of_a_search_are_of_the_same_kind(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Manager, "objective", lambda self, trial: float(trial.number))
+    for storage in ("sqlite:///study.db", "studies/study.log"):
+        search = [*COMMAND, "-n", "60", "-optimize", "--n-trials", "1", "--no-optim-plots", "--storage", storage]
+        search += ["--study-name", "s"]
+        cli.main([*search, "-params", "learning_starts:20"])
+        cli.main([*search, "--seed", "3", "--sampler", "random", "-params", "learning_starts:20"])
+        for changed, words in (
+            (["--env", "MountainCarContinuous-v0"], "env 'Pendulum-v1' .now 'MountainCarContinuous-v0'"),
+            (["-n", "90"], "n_timesteps 60 .now 90"),
+        ):
+            with pytest.raises(SystemExit, match=f"--study-name s: the search in {storage} was begun with .*{words}"):
+                cli.main([*search, *changed, "-params", "learning_starts:20"])
+        with pytest.raises(SystemExit, match="gamma not given .now 0.9., learning_starts 20 .now 30"):
+            cli.main([*search, "-params", "learning_starts:30", "gamma:0.9"])
+        with pytest.raises(SystemExit, match="--study-name s: .*algo 'sac_sample' .now 'dac'"):
+            cli.main([*search, "--algo", "dac"])
+    names = optuna.get_all_study_names("sqlite:///study.db")
+    assert names == ["s"] and len(optuna.load_study(storage="sqlite:///study.db", study_name="s").trials) == 2
+    # One that was begun by another program goes on.
+    optuna.create_study(storage="sqlite:///study.db", study_name="other", direction="maximize").add_trial(
+        optuna.trial.create_trial(value=1.0)
+    )
+    search = [*COMMAND, "-n", "60", "-optimize", "--n-trials", "1", "--no-optim-plots", "--study-name", "other"]
+    cli.main([*search, "--storage", "sqlite:///study.db"])
+    assert len(optuna.load_study(storage="sqlite:///study.db", study_name="other").trials) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-n", "0"], "-n must be at least 1, in steps, not 0"),
+        (["-n", "-5"], "-n must be at least 1, in steps, not -5"),
+        (["--trial-id", "-1"], "trial_id must be at least 1, not -1"),
+        (["--storage", "sqlite:///s.db"], "--storage has no effect without -optimize or --trial-id"),
+        (["--study-name", "s"], "--study-name has no effect without -optimize or --trial-id"),
+        (["-optimize", "-i", "model.zip"], "-optimize searches with new agents: leave out -i model.zip"),
+        (["--conf-file", "none.yml"], "--conf-file none.yml cannot be read: .*No such file"),
+        (["--conf-file", "broken.yml"], "--conf-file broken.yml cannot be read: while parsing"),
+        (["--conf-file", "none"], "--conf-file none cannot be read: No module named 'none'"),
+        (["--conf-file", "json"], "--conf-file json cannot be read: module 'json' has no attribute 'hyperparams'"),
+        (["--gym-packages", "none"], "--gym-packages none cannot be imported: No module named 'none'"),
+        (["-params", "env_wrapper:'none.Wrapper'"], "env_wrapper cannot be imported: No module named 'none'"),
+        (["-params", "callback:'json.None'"], "callback cannot be imported: module 'json' has no attribute 'None'"),
+        (["-params", "noise_type:'normal'"], "noise_type=normal needs noise_std: give it too"),
+        (["-params", "noise_type:'x'", "noise_std:0.1"], 'noise_type=x: Unknown noise type "x"'),
+        (["--env-kwargs", "g:9.0", "-params", "normalize:'dict(clip=1)'"], "normalize=dict.clip=1.: .*'clip'"),
+        (["--env-kwargs", "h:9.0"], "Pendulum-v1 cannot be made with env_kwargs={'h': 9.0}"),
+    ],
+)
+def test_arguments_that_mean_nothing_are_refused_in_a_line(
+    arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("broken.yml").write_text("a: [")
+    Path("model.zip").touch()
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(SystemExit, match=words):
+        cli.main([*COMMAND, *arguments])
+    assert [path for path in sorted(tmp_path.rglob("*")) if path.is_file()] == before
+
+
+def test_a_folder_in_which_another_process_trains_is_not_touched(run, tmp_path: Path) -> None:
+    run("--run-dir", "a", "-n", "60")
+    before = {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
+    with take_folder(Path("a")), pytest.raises(SystemExit, match="a is in use: another process trains in it"):
+        run("--run-dir", "a", "-n", "90")
+    assert {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()} == before
+    run("--run-dir", "a", "-n", "90")
+    # Another process has made it since, and has not begun yet.
+    Path("b").mkdir()
+    with take_folder(Path("b")), pytest.raises(SystemExit, match="b is in use"):
+        run("--run-dir", "b", "-n", "60")
+    assert list(Path("b").iterdir()) == []
+
+
+def test_results_without_a_checkpoint_are_not_written_over(run) -> None:
+    run("--run-dir", "a", "-n", "60", "--eval-freq", "30")
+    for path in Path("a").glob("checkpoint-*"):
+        shutil.rmtree(path)
+    before = {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
+    for name in ("Pendulum-v1.zip", "best_model.zip", "evaluations.npz"):
+        with pytest.raises(SystemExit, match=f"--run-dir a has {name}, but no checkpoint to go on from"):
+            run("--run-dir", "a", "-n", "60", "--eval-freq", "30")
+        assert {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()} == before
+        Path("a", name).unlink()
+        del before[Path("a", name)]
+    run("--run-dir", "a", "-n", "60", "--eval-freq", "30")
+    assert steps("a")[-1] == 60
+
+
 def test_a_record_that_was_not_written_whole_is_no_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
 
@@ -363,6 +459,18 @@ def test_the_last_checkpoint_of_a_run_that_is_not_finished_is_watched(
     last = f"checkpoint-{steps('a')[-1]:012d}"
     assert Path(model_path(Path("a"), "sac_sample", "Pendulum-v1")[1]) == Path("a") / last / "model.zip"
     assert f"not finished: its last checkpoint, {last}, is taken" in capsys.readouterr().out
+    # That of a run which was interrupted, goes on and has not ended again is older.
+    run("--run-dir", "a", "-n", "120", "--eval-freq", "-1")
+    assert has_ended(Path("a"))
+    os.utime("a/Pendulum-v1.zip", (1, 1))
+    assert not has_ended(Path("a"))
+    assert Path(model_path(Path("a"), "sac_sample", "Pendulum-v1")[1]) == Path("a") / last / "model.zip"
+    cli.main([*["enjoy", "--algo", "sac_sample", "--env", "Pendulum-v1", "--no-render", "-n", "5", "--run-dir", "a"]])
+    assert f"its last checkpoint, {last}, is taken" in capsys.readouterr().out
+    Path("logs/sac_sample").mkdir(parents=True)
+    os.rename("a", "logs/sac_sample/Pendulum-v1_1")
+    cli.main([*["enjoy", "--algo", "sac_sample", "--env", "Pendulum-v1", "--no-render", "-n", "5", "-f", "logs"]])
+    assert "Pendulum-v1.zip is older than its run's last checkpoint" in capsys.readouterr().err
     (tmp_path / "b").mkdir()
     with pytest.raises(SystemExit, match="neither a model of a finished run nor a checkpoint"):
         model_path(tmp_path / "b", "sac_sample", "Pendulum-v1")
@@ -495,7 +603,7 @@ def test_help_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str])
 def atari_run(folder: Path, **hyperparams: Any) -> Manager:
     """A manager of a run of SR-SPR on a game, whose settings are read."""
     pytest.importorskip("ale_py")
-    args = argparse.Namespace(algo="srspr", optimize_hyperparameters=False)
+    args = argparse.Namespace(algo="srspr", optimize_hyperparameters=False, n_timesteps=-1)
     options: dict[str, Any] = {"eval_freq": -1, "device": "cpu", "verbose": 0, "hyperparams": hyperparams}
     found = Manager(Data(), args, "srspr", "ALE/Breakout-v5", str(folder), **options)
     _, found.env_wrapper, _, _ = found._preprocess_hyperparams(found.read_hyperparameters()[0])

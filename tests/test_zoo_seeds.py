@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from sb3_sample import cli, zoo
+from sb3_sample import cli, lockstep, zoo
 from tests.test_zoo_runs import COMMAND, OFF_POLICY, check_equal, outcome, steps
 
 zoo.register()
@@ -106,6 +106,20 @@ def test_interrupted_and_started_again(
     )
     check_equal(ours, theirs)
     assert "replay.rewards" in ours
+
+
+def test_interrupted_without_a_folder_all_are_saved(
+    call: Call, callback: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setenv("HOW", "signal")
+    # Saving takes longer than those are waited for that need not save.
+    monkeypatch.setattr(lockstep, "PATIENCE", 0.0)
+    with pytest.raises(SystemExit) as caught:
+        cli.main([*COMMAND, "-n", "120", "--seeds", "3", "-params", *OFF_POLICY, *callback])
+    assert caught.value.code == 130
+    assert "interrupted; all were saved" in capsys.readouterr().err
+    folders = sorted(Path("logs/sac_sample").iterdir())
+    assert len(folders) == 3 and all((folder / "Pendulum-v1.zip").exists() for folder in folders)
 
 
 def test_a_run_that_fails_and_the_others_go_on(

@@ -1,5 +1,6 @@
 """
-Locks of files that this process holds: its forked children do not have them, and a process that has ended has none.
+Locks of files and folders that this process holds: its forked children do not have them, and a process that has ended
+has none.
 """
 
 import contextlib
@@ -25,9 +26,9 @@ if hasattr(os, "register_at_fork"):
 
 class Lock:
     """
-    Lock of a file, held until ``release`` or the end of the process.
+    Lock of a file or folder, held until ``release`` or the end of the process.
 
-    :param descriptor: of the open file, which this process has locked
+    :param descriptor: of the open file or folder, which this process has locked
     """
 
     def __init__(self, descriptor: int):
@@ -80,6 +81,26 @@ def is_taken(path: Path) -> bool:
     if held is None:
         raise _without_locks(path)
     return not held
+
+
+def take_folder(folder: Path) -> Lock | None:
+    """
+    Lock a folder, without waiting and without a file in it.
+
+    :param folder: the folder
+    :return: the lock; None where folders cannot be locked (on Windows, and in some network file systems)
+    :raises BlockingIOError: another process has it, on this machine or on another that shares the folder
+    """
+    if not hasattr(os, "O_DIRECTORY"):
+        return None
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    held = temporary.lock(descriptor)
+    if held:
+        return Lock(descriptor)
+    os.close(descriptor)
+    if held is False:
+        raise BlockingIOError(errno.EAGAIN, "another process has locked it", str(folder))
+    return None
 
 
 def take(path: Path) -> Lock | None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from sb3_sample.arguments import check_device
 from sb3_sample.exits import refuse
 from sb3_sample.study import analysis_command
 from sb3_sample.study.cluster import check
@@ -102,6 +103,8 @@ def _run(options: argparse.Namespace) -> None:
             check(options.ray, options.gpus)
         elif options.gpus is not None:
             raise ValueError(f"--gpus is for runs in a Ray cluster: give --ray too, not --gpus {options.gpus:g} alone")
+        if options.ray is None:
+            check_device(options.device)
         if options.ray is not None and options.dry_run:
             raise ValueError("--dry-run measures this machine: leave --ray out")
         if options.batch_seeds and options.dry_run:

@@ -119,17 +119,7 @@ def _adapt_experiment_manager(module: Any) -> None:
         if given.arguments["algo"] in ALGORITHMS:
             if not given.arguments.get("config"):
                 given.arguments["config"] = str(HYPERPARAMS / f"{given.arguments['algo']}.yml")
-            if given.arguments.get("trial_id") == 0:
-                raise ValueError(
-                    "trial_id must be at least 1, not 0: the zoo takes 0 for no trial and would train with the "
-                    "parameters of the file; pass trial 0's parameters with -params"
-                )
-            lacking = [name for name in ("storage", "study_name") if not given.arguments.get(name)]
-            if given.arguments.get("trial_id") is not None and lacking:
-                options = " and ".join(f"--{name.replace('_', '-')}" for name in lacking)
-                raise ValueError(
-                    f"trial_id={given.arguments['trial_id']} is the number of a trial in a study: give {options} too"
-                )
+            _check_arguments(given.arguments)
         original_init(*given.args, **given.kwargs)
 
     # ``load_trial`` accepts anything stored as hyperparameters, some of which the zoo evaluates as Python or imports.
@@ -196,6 +186,30 @@ def _adapt_experiment_manager(module: Any) -> None:
     manager.hyperparameters_optimization = optimize
     manager.read_hyperparameters = read_hyperparameters
     manager.is_robotics_env = staticmethod(is_robotics_env)
+
+
+def _check_arguments(given: Mapping[str, Any]) -> None:
+    """Refuse arguments of ``ExperimentManager`` that the zoo would ignore or take for others."""
+    trial, searches = given.get("trial_id"), given.get("optimize_hyperparameters")
+    if trial == 0:
+        raise ValueError(
+            "trial_id must be at least 1, not 0: the zoo takes 0 for no trial and would train with the parameters of "
+            "the file; pass trial 0's parameters with -params"
+        )
+    if trial is not None and trial < 0:
+        raise ValueError(f"trial_id must be at least 1, not {trial}")
+    of_study = [name for name in ("storage", "study_name") if given.get(name)]
+    if trial is not None and len(of_study) < 2:
+        lacking = " and ".join(_option(name) for name in ("storage", "study_name") if name not in of_study)
+        raise ValueError(f"trial_id={trial} is the number of a trial in a study: give {lacking} too")
+    if of_study and trial is None and not searches:
+        raise ValueError(f"{_option(of_study[0])} has no effect without -optimize or --trial-id: give one of them too")
+    if searches and given.get("trained_agent"):
+        raise ValueError(f"-optimize searches with new agents: leave out -i {given['trained_agent']}")
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 class _VecNormalize:

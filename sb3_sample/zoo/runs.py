@@ -12,9 +12,11 @@ import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import rl_zoo3.exp_manager
+import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -32,6 +34,7 @@ from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.reading import read_dataset
 from sb3_sample.run_logs import OFFLINE
 from sb3_sample.saving.folders import Folder, is_plain
+from sb3_sample.saving.locks import Lock, take_folder
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.training.seats import all_made
@@ -39,7 +42,8 @@ from sb3_sample.warn import warn
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import RunError
 from sb3_sample.zoo.patches import monitors_go_on
-from sb3_sample.zoo.records import Record, checkpoints
+from sb3_sample.zoo.records import Record, all_checkpoints, checkpoints
+from sb3_sample.zoo.trials import check_search
 
 #: Arguments of the zoo that identify a run, besides its hyperparameters. Its length, its device and its output may
 #: change.
@@ -47,6 +51,10 @@ COMPARED = (
     "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "env_kwargs", "eval_env_kwargs",
     "eval_freq", "eval_episodes", "n_eval_envs", "save_freq",
 )  # fmt: skip
+#: Arguments of the zoo on which the trials of a search depend, besides its hyperparameters.
+SEARCHED = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_episodes")
+#: Hyperparameters that name classes to import.
+_IMPORTED = ("env_wrapper", "vec_env_wrapper", "callback")
 #: Hyperparameters from which the zoo makes ``action_noise``.
 _OF_NOISE = {"noise_type", "noise_std"}
 #: Settings that change the observations, and belong to a trained model as its arguments do.
@@ -120,6 +128,8 @@ class Manager(ExperimentManager):
 
     def __init__(self, data: Data, args: argparse.Namespace, *positional: Any, **named: Any):
         _check_data(data, args)
+        if args.n_timesteps == 0 or args.n_timesteps < -1:
+            raise RunError(f"-n must be at least 1, in steps, not {args.n_timesteps}")
         super().__init__(args, *positional, **named)
         self._data = data
         self._dataset: Dataset | None = None
@@ -154,13 +164,22 @@ class Manager(ExperimentManager):
             self.params_path = f"{self.save_path}/{self.env_name}"
         self._has_made_folder = True
 
+    def close(self) -> None:
+        """Release the run's folder for others. More than one call does no harm."""
+
     def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         found: dict[str, Any] = super().load_trial(*args, **kwargs)
         self._of_trial = set(found)
         return found
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        hyperparams, saved = super().read_hyperparameters()
+        try:
+            hyperparams, saved = super().read_hyperparameters()
+        except (OSError, ImportError, AttributeError, yaml.YAMLError) as error:
+            if isinstance(error, AttributeError) and not isinstance(error.obj, ModuleType):
+                raise
+            raise RunError(f"--conf-file {self.config} cannot be read: {' '.join(str(error).split())}") from error
+        self._settings = saved
         if self.continue_training and self.algo in ALGORITHMS:
             # The entry of the task is not what the model was trained with: its file has that.
             given = {*(self.custom_hyperparams or {}), *self._of_trial}
@@ -190,6 +209,12 @@ class Manager(ExperimentManager):
             found = super()._preprocess_hyperparams(hyperparams)
         except (SyntaxError, NameError) as error:
             raise RunError(f"a hyperparameter that is a text of Python is none: {error}") from error
+        except (ImportError, AttributeError) as error:
+            # Not one of the class's own, when it is made.
+            if isinstance(error, AttributeError) and not isinstance(error.obj, ModuleType):
+                raise
+            names = ", ".join(name for name in _IMPORTED if hyperparams.get(name))
+            raise RunError(f"{names or 'a hyperparameter'} cannot be imported: {error}") from error
         if self.optimize_hyperparameters and any(isinstance(each, DiagnosticsCallback) for each in found[2]):
             raise RunError(
                 "callback: DiagnosticsCallback does not go with -optimize, whose trials make no environment for it: "
@@ -219,6 +244,29 @@ class Manager(ExperimentManager):
                 "the environment"
             )
         return found
+
+    def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> Any:
+        try:
+            return super()._preprocess_action_noise(hyperparams, saved, env)
+        except KeyError as error:
+            raise RunError(f"noise_type={hyperparams['noise_type']} needs {error.args[0]}: give it too") from error
+        except (RuntimeError, AssertionError) as error:
+            raise RunError(f"noise_type={hyperparams['noise_type']}: {error}") from error
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        try:
+            return super()._maybe_normalize(env, eval_env)  # type: ignore[no-any-return]
+        except TypeError as error:
+            raise RunError(f"normalize={self._settings.get('normalize')}: {error}") from error
+
+    def hyperparameters_optimization(self) -> None:
+        if self.algo in ALGORITHMS and self.storage and self.study_name:
+            values = {name: getattr(self.args, name) for name in SEARCHED} | self._settings
+            values |= {name: getattr(self, name) for name in ("n_timesteps", "n_evaluations")}
+            check_search(
+                self.storage, self.study_name, {name: _spellings(name, value)[0] for name, value in values.items()}
+            )
+        super().hyperparameters_optimization()
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -351,10 +399,31 @@ class RunManager(Manager):
         # have it.
         self._progress_bar, self.show_progress = self.show_progress, False
         self._record: Record
+        # Of the folder, from before its first file to the end.
+        self._lock: Lock | None = None
 
     @property
     def _folder(self) -> Path:
         return Path(self.save_path)
+
+    def _make_folder(self) -> None:
+        if self._lock is not None:
+            return
+        super()._make_folder()
+        try:
+            self._lock = take_folder(self._folder)
+        except BlockingIOError as error:
+            # What is in the folder is the other's, even if this run has made it.
+            self._has_made_folder = False
+            raise RunError(f"{self._folder} is in use: another process trains in it") from error
+        if self._start.record is None and all_checkpoints(self._folder):
+            raise RunError(
+                f"another process has just trained in {self._folder}: the same command, given again, goes on"
+            )
+
+    def close(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()

@@ -16,7 +16,7 @@ from typing import Any
 import rl_zoo3.train
 
 from sb3_sample.lockstep import Seat, present
-from sb3_sample.run_logs import OFFLINE
+from sb3_sample.run_logs import EVALUATIONS, OFFLINE
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.many import train_together
 from sb3_sample.saving.temporary import is_temporary
@@ -116,6 +116,11 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
                 f"--run-dir {folder} holds files, but no run with checkpoints: it must be the folder of such a run, an "
                 "empty one or none"
             )
+        if trained := sorted(path.name for path in (*folder.glob("*.zip"), *folder.glob(EVALUATIONS))):
+            raise RunError(
+                f"--run-dir {folder} has {trained[0]}, but no checkpoint to go on from, and a new run would write over "
+                "it: name another folder, or remove this one"
+            )
         return Start(list(arguments), freq or CHECKPOINT_FREQ, folder)
     record = Record.read(folder)
     check_monitor_files(folder)
@@ -175,16 +180,26 @@ def training() -> Iterator[Callable[[Start | None, Sequence[str], Data], None]]:
         it at the same time
     """
     starts: dict[Seat | None, tuple[Start | None, Data]] = {}
+    managers: dict[Seat | None, Manager] = {}
 
     def manager(*positional: Any, **named: Any) -> Manager:
-        start, data = starts[present()]
-        return Manager(data, *positional, **named) if start is None else RunManager(start, data, *positional, **named)
+        seat = present()
+        start, data = starts[seat]
+        managers[seat] = made = (
+            Manager(data, *positional, **named) if start is None else RunManager(start, data, *positional, **named)
+        )
+        return made
 
     def train(start: Start | None, arguments: Sequence[str], data: Data) -> None:
-        starts[present()] = start, data
+        seat = present()
+        starts[seat] = start, data
         # The zoo reads it at once.
         sys.argv = ["sb3-sample train", *arguments]
-        rl_zoo3.train.train()
+        try:
+            rl_zoo3.train.train()
+        finally:
+            if seat in managers:
+                managers.pop(seat).close()
 
     with managed_by(manager, rl_zoo3.train):
         yield train
@@ -244,7 +259,14 @@ def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
         try:
             train_together(seats, (options.run_dir or Path("logs")) if saves else None)
         except KeyboardInterrupt as error:
-            on = f"the same command with --run-dir {options.run_dir} goes on" if options.run_dir else "all were saved"
+            unsaved = [
+                seat.name
+                for seed, seat in zip(seeds, seats, strict=True)
+                if seed in failed or not (seat.began and seat.has_ended)
+            ]
+            on = "all were saved" if not unsaved else f"not saved: {', '.join(unsaved)}"
+            if options.run_dir:
+                on = f"the same command with --run-dir {options.run_dir} goes on"
             raise KeyboardInterrupt(f"interrupted; {on}") from error
     if failed:
         words = "; ".join(f"seed {seed}: {type(error).__name__}: {error}" for seed, error in failed.items())

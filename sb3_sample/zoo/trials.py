@@ -21,6 +21,8 @@ from sb3_sample.saving.untrusted import BadFile, open_regular
 
 #: Largest size of a line of a journal, in bytes.
 MAX_LINE = 2**20
+#: Name under which a study has the settings of its search.
+_SETTINGS = "sb3_sample"
 #: Words in the definition of a table that computes something when it is read; none of Optuna's tables does.
 _COMPUTES = re.compile(r"\b(virtual|generated|as)\b", re.IGNORECASE)
 
@@ -54,6 +56,40 @@ def check_storage(storage: str) -> None:
             open_regular(file).close()
             _check_tables(file)
         optuna.get_all_study_names(_opened(storage))
+
+
+def check_search(storage: str, study_name: str, settings: Mapping[str, str]) -> None:
+    """
+    Record the settings of a search in its study, or compare them with those of the search that has begun it, since
+    their trials would be compared with each other. Studies without such a record are not checked.
+
+    :param storage: as in :func:`stored_params`
+    :param study_name: name of the study, made if it is not there
+    :param settings: as text, by name
+    :raises BadFile: (a ``ValueError``) if they differ, or Optuna has not written the storage
+    """
+    check_storage(storage)
+    if storage.endswith(".log"):
+        Path(storage).parent.mkdir(parents=True, exist_ok=True)
+    with _reading(storage, f"study {study_name!r}"):
+        study = optuna.create_study(
+            storage=_opened(storage), study_name=study_name, load_if_exists=True, direction="maximize"
+        )
+        before = study.user_attrs.get(_SETTINGS)
+        if before is None and not study.trials:
+            study.set_user_attr(_SETTINGS, dict(settings))
+    if not isinstance(before, dict):
+        return
+    differences = [
+        f"{name} {before.get(name, 'not given')!s:.200} (now {settings.get(name, 'not given')})"
+        for name in sorted(before.keys() | settings.keys())
+        if before.get(name) != settings.get(name)
+    ]
+    if differences:
+        raise BadFile(
+            f"--study-name {study_name}: the search in {storage} was begun with {', '.join(differences)}, and its "
+            "trials cannot be compared with those of this one: search as then, or name another --study-name"
+        )
 
 
 def _opened(storage: str) -> Any:

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_sample.exits import refuse
+from sb3_sample.run_logs import has_ended
 from sb3_sample.saving import container
 from sb3_sample.saving.attributes import Restorer
 from sb3_sample.saving.checkpoint import KIND, MODEL, STATE
@@ -138,6 +139,12 @@ class _Watch:
                 raise RunError(f"{env_name.gym_id} is not registered: give --env, or --gym-packages")
             if options.run_dir is None:
                 found = get_model_path(exp_id, folder, algo, env_name, *which)
+                if Path(found[1]).name == f"{env_name}.zip" and not has_ended(Path(found[2])):
+                    print(
+                        f"sb3-sample: {found[1]} is older than its run's last checkpoint, which is shown with "
+                        f"--run-dir {found[2]}",
+                        file=sys.stderr,
+                    )
             else:
                 found = model_path(options.run_dir, algo, env_name, *which)
                 beside = Path(found[1]).parent
@@ -275,7 +282,7 @@ def model_path(
             return of_checkpoint(steps)
     elif load_last_checkpoint and made and not load_best:
         return of_checkpoint(max(made))
-    elif not (load_best or load_last_checkpoint or (run_dir / f"{env_name}.zip").exists()):
+    elif not (load_best or load_last_checkpoint or ((run_dir / f"{env_name}.zip").exists() and has_ended(run_dir))):
         if not made:
             refuse("", f"{run_dir} has neither a model of a finished run nor a checkpoint")
         print(f"The run in {run_dir} is not finished: its last checkpoint, {made[max(made)].name}, is taken")

@@ -318,3 +318,7 @@ def test_a_folder_that_cannot_be_one_is_refused_in_a_line(tmp_path: Path, capsys
     with pytest.raises(SystemExit):
         cli.main(["study", "run", str(tmp_path / "plan.yml"), "--folder", str(tmp_path / "file")])
     assert "sb3-sample study run: " in (said := capsys.readouterr().err) and "Traceback" not in said
+    with pytest.raises(SystemExit):
+        cli.main(["study", "run", str(tmp_path / "plan.yml"), "--folder", str(tmp_path / "new"), "--device", "gpu"])
+    assert "study run: device must be 'auto', 'cpu', 'cuda' or another of torch's, not 'gpu'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
