@@ -181,6 +181,17 @@ def test_true_value_with_termination() -> None:
     assert results["overestimation_soft"] == pytest.approx(-3.8, abs=1e-5)
 
 
+@pytest.mark.parametrize(("returns", "scale"), [([], 1), ([0, 0], 1), ([0, 8], 4)])
+def test_rewards_are_scaled_as_those_of_batches(returns: list[float], scale: float) -> None:
+    """XQC's scale leaves rewards as they are until two returns differ."""
+    model = sac(gamma=0.9, ent_coef=0.0, reward_scale="xqc")
+    answer(model.critic, 0, 0)
+    for each in returns:
+        model.reward_scaler.on_step(model.learner, np.array([each]), np.array([True]), [{}])
+    results = ready(model, Constant(2, length=2), rollout_length=2).measure()
+    assert results["overestimation"] == pytest.approx(-3.8 / scale, rel=1e-5)
+
+
 def test_mean_over_ensemble_and_quantiles() -> None:
     model = bro(gamma=0.5, ent_coef=0.0)
     answer(model.critic, [1, 2, 3, 4, 5], [6, 6, 6, 6, 11])

@@ -314,7 +314,8 @@ class DiagnosticsCallback(PeriodicMeasurement):
             following = normalize.normalize_reward(following)
         scaler = self.model.reward_scaler
         if scaler is not None:
-            following = following / scaler.divisor(None).item() + scaler.shift
+            unscaled = torch.as_tensor(following, dtype=torch.float64, device=self.model.device)
+            following = scaler.scaled(unscaled, None).cpu().numpy()
         return Rollout(value, following.astype(np.float64), np.array(log_probs), terminated)
 
     def _overfitting(self, training: Batch) -> dict[str, float]:

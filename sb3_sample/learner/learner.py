@@ -216,6 +216,8 @@ class Learner(Executable):
         self._acting: tuple[Exploration, Acting | None] | None = None
         #: Whether ``.grad`` holds gradients of an earlier gradient step than the last, as a compiled step leaves none.
         self.gradients_are_stale = False
+        # Whether the statistics of the observations were checked.
+        self._checked_statistics = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
         self._checked_step = self._checked_actions = False
         # TD errors of the last gradient step's batch.
@@ -580,6 +582,13 @@ class Learner(Executable):
                 warn(
                     f"{type(scaler).__name__} scales rewards by returns, and this learner was told of no step: call "
                     "its on_step at those of the environments, or pass reward_scale=None, or 'linear'"
+                )
+            norm, is_checked, self._checked_statistics = self.observation_norm, self._checked_statistics, True
+            if norm is not None and not is_checked and norm.count < 1:
+                warn(
+                    "normalize_observations=True has no effect, as this learner was shown no observations: call its "
+                    "on_observations before each action and on_step after it, or learner.observation_norm.update with "
+                    "those of the data, or pass normalize_observations=False"
                 )
             self.plasticity.before_gradient_steps(self, 1)
             # A compiled or captured step receives the rates, settings and moments set since the last one.

@@ -25,8 +25,6 @@ class RewardScale(BatchTransform):
 
     #: Whether the scale is computed from steps in an environment, and does not exist without them.
     needs_steps: ClassVar[bool] = True
-    #: Added to the rewards after the division.
-    shift: float = 0.0
 
     @property
     def waits_for_data(self) -> bool:
@@ -50,9 +48,19 @@ class RewardScale(BatchTransform):
         """
         raise NotImplementedError
 
+    def scaled(self, rewards: torch.Tensor, task: torch.Tensor | None) -> torch.Tensor:
+        """
+        Scale rewards.
+
+        :param rewards: (B, 1), or of any shape if there is one task
+        :param task: as in :meth:`divisor`
+        :return: what the critics learn from in their place
+        """
+        divisor = self.divisor(task)
+        return (rewards.to(divisor.dtype) / divisor).to(rewards.dtype)
+
     def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
-        rewards, divisor = batch.rewards, self.divisor(task_of(batch))
-        return batch._replace(rewards=(rewards.to(divisor.dtype) / divisor).to(rewards.dtype))
+        return batch._replace(rewards=self.scaled(batch.rewards, task_of(batch)))
 
 
 def task_of(batch: Batch) -> torch.Tensor | None:
@@ -137,9 +145,8 @@ class StdScale(ReturnScale):
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return self.moments.var.sqrt() + self.eps
 
-    def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
-        scaled = super().transform(batch, noise)
-        return scaled._replace(rewards=torch.where(self.moments.var > 0, scaled.rewards, batch.rewards))
+    def scaled(self, rewards: torch.Tensor, task: torch.Tensor | None) -> torch.Tensor:
+        return torch.where(self.moments.var > 0, super().scaled(rewards, task), rewards)
 
 
 class StdOrMaxScale(ReturnScale):
@@ -381,8 +388,8 @@ class LinearScale(RewardScale):
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return 1 / self.factor
 
-    def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
-        return batch._replace(rewards=batch.rewards * self.factor + self.shift)
+    def scaled(self, rewards: torch.Tensor, task: torch.Tensor | None) -> torch.Tensor:
+        return rewards * self.factor + self.shift
 
 
 #: Rules by the name that ``reward_scale`` takes: the name of the method that published the rule, or "linear".

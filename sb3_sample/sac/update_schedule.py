@@ -13,6 +13,12 @@ from sb3_sample.warn import warn
 class UpdateSchedule(DecidesCompiling, UpdatesOwed):
     """Part of an off-policy algorithm, before Stable-Baselines3's class: when it learns, and how many steps at once."""
 
+    def _before_training(self: Any) -> None:
+        """Forget the plan of a ``learn`` that was ended before its first gradient step."""
+        super()._before_training()  # type: ignore[misc]
+        if self._n_updates == 0:
+            self.planned_updates = self.schedule_steps
+
     def _before_turns(self: Any) -> None:
         """
         Plan the gradient steps of the first ``learn``, and decide, with ``compile="auto"`` once and for all, whether

@@ -392,6 +392,25 @@ def test_a_learner_that_is_told_of_no_step() -> None:
         given.update(batch)
 
 
+def test_a_learner_that_was_shown_no_observations() -> None:
+    spaces = [getattr(vec(), f"{name}_space") for name in ("observation", "action")]
+    batch = random_batch(sac(), seed=0)
+    given = SAC.learner(*spaces, normalize_observations=True)
+    with pytest.warns(UserWarning, match="normalize_observations=True has no effect, as this learner was shown no"):
+        given.update(batch)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        given.update(batch)  # once
+        of_data, of_steps = (SAC.learner(*spaces, normalize_observations=True) for _ in range(2))
+        of_data.observation_norm.update(batch.observations)
+        of_data.update(batch)
+        for _ in range(2):
+            of_steps.on_observations(np.ones((1, 3), np.float32))
+            of_steps.on_step(np.ones(1), np.zeros(1, dtype=bool), [{}])
+        of_steps.update(batch)
+    assert of_steps.observation_norm.mean.tolist() == pytest.approx([1, 1, 1], rel=1e-3)
+
+
 def test_one_task_is_not_looked_up() -> None:
     """With one task, "task" is anything: a name in the infos, two numbers among the observations."""
     of, o = learner(), torch.zeros(2, 1)

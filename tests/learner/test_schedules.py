@@ -27,6 +27,21 @@ def test_a_learn_that_ends_in_the_warm_up_plans_nothing(tmp_path: Path) -> None:
     assert given.planned_updates == 70
 
 
+def test_a_learn_that_was_ended_in_the_warm_up_plans_nothing(tmp_path: Path) -> None:
+    arguments = {"learning_rate_schedule": "linear", "replay_ratio": 2, "learning_starts": 10}
+    model = sac(**arguments)
+    model.learn(20, callback=lambda *_: model.num_timesteps < 5)
+    assert model._n_updates == 0 and model.num_timesteps == 5
+    model.save(tmp_path / "model.zip")
+    assert SAC.load(tmp_path / "model.zip", env=vec()).learn(15, reset_num_timesteps=False).planned_updates == 30
+    assert model.learn(30).planned_updates == 60
+    assert model.learner.scheduled_rate == pytest.approx(3e-4 * (1 - model._n_updates / 60)) and model._n_updates > 40
+    # A run that goes on from a checkpoint of the warm-up has its plan.
+    run = sac(**arguments)
+    run.learn(20, checkpoint=tmp_path / "run", callback=lambda *_: run.num_timesteps < 5)
+    assert sac(**arguments).learn(30, checkpoint=tmp_path / "run").planned_updates == 40
+
+
 def test_a_learn_without_gradient_steps_plans_nothing() -> None:
     model = sac(learning_rate_schedule="linear", replay_ratio=0, learning_starts=10).learn(20)
     assert model.planned_updates is None and model._n_updates == 0
