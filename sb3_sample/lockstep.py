@@ -237,9 +237,11 @@ class Group:
                 pass
         except BaseException as error:
             self.stop = error
-            # Those who interrupt are waited for, since the trainings may save what they have learned; a second
-            # interrupt ends this too.
-            self._over.wait(None if isinstance(error, (KeyboardInterrupt, SystemExit)) else PATIENCE)
+            # After a first signal the trainings may save what they have learned, however long it takes; another one
+            # ends this too. Where signals are noted, the error is that of the second.
+            may_save = isinstance(error, (KeyboardInterrupt, SystemExit)) and self.received() is None
+            while not self._over.wait(1.0 if may_save else PATIENCE) and may_save:
+                pass
             raise
         finally:
             before.put_back()

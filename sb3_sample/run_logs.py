@@ -57,10 +57,10 @@ class Evaluations(dict[str, np.ndarray]):
 def has_ended(folder: Path) -> bool:
     """
     :param folder: a run's folder
-    :return: whether it has a final model that is not older than its checkpoints, as that of a run is which was ended
-        before and goes on
+    :return: whether it has a final model at least as new as its checkpoints; a run that was ended and goes on has an
+        older one
     """
-    made = [*folder.glob("checkpoint-*"), *(folder / OFFLINE).glob("checkpoint-*")]
+    made = [*folder.glob("checkpoint-[0-9]*"), *(folder / OFFLINE).glob("checkpoint-[0-9]*")]
     final = [path for path in folder.glob("*.zip") if not path.name.startswith(("best_model.", "rl_model_"))]
     return bool(final) and max(_times(final), default=0) >= max(_times(made), default=0)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from sb3_sample import lockstep
 from sb3_sample.lockstep import (
     ACTIONS,
     BEGIN,
@@ -210,6 +211,25 @@ def test_an_interrupt_of_the_waiting_thread_ends_all() -> None:
     seed(7)
     assert after == draw()
     assert sorted(ended) == ["0", "1", "2"]
+
+
+def test_a_second_signal_does_not_wait_for_a_training_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first was noted, as in runs with checkpoints."""
+    ended: list[str] = []
+    goes_on = threading.Event()
+
+    def body(seat: Seat) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        goes_on.wait(60)
+        ended.append(seat.name)
+
+    monkeypatch.setattr(lockstep, "PATIENCE", 0.1)
+    made = group(body)
+    made.received = lambda: signal.SIGINT
+    with pytest.raises(KeyboardInterrupt):
+        made.run()
+    assert ended == []
+    goes_on.set()
 
 
 @pytest.mark.parametrize(

@@ -330,6 +330,20 @@ def test_the_trials_of_a_search_are_of_the_same_kind(
             cli.main([*search, "-params", "learning_starts:30", "gamma:0.9"])
         with pytest.raises(SystemExit, match="--study-name s: .*algo 'sac_sample' .now 'dac'"):
             cli.main([*search, "--algo", "dac"])
+    # A search of which no trial has come to a value may be begun anew with others.
+    with monkeypatch.context() as patch:
+        patch.setattr(Manager, "objective", lambda self, trial: float("nan"))
+        for words in ("learning_starts:20", "learning_starts:30"):
+            with pytest.raises(SystemExit, match="no trial was completed"):
+                cli.main([*search[:-1], "failed", "-params", words])
+    # Objects are written without their place in memory.
+    Path("conf.py").write_text(
+        "hyperparams = {'default': dict(n_timesteps=60, policy='MlpPolicy', policy_kwargs=dict(net_arch=[8], "
+        "activation_fn=lambda: None))}"
+    )
+    cli.main([*search[:-1], "objects", "--storage", "sqlite:///objects.db", "--conf-file", "conf.py"])
+    recorded = optuna.load_study(storage="sqlite:///objects.db", study_name="objects").user_attrs["sb3_sample"]
+    assert "'activation_fn': <function <lambda>>" in recorded["policy_kwargs"]
     names = optuna.get_all_study_names("sqlite:///study.db")
     assert names == ["s"] and len(optuna.load_study(storage="sqlite:///study.db", study_name="s").trials) == 2
     # One that was begun by another program goes on.
@@ -355,8 +369,11 @@ def test_the_trials_of_a_search_are_of_the_same_kind(
         (["--conf-file", "none"], "--conf-file none cannot be read: No module named 'none'"),
         (["--conf-file", "json"], "--conf-file json cannot be read: module 'json' has no attribute 'hyperparams'"),
         (["--gym-packages", "none"], "--gym-packages none cannot be imported: No module named 'none'"),
-        (["-params", "env_wrapper:'none.Wrapper'"], "env_wrapper cannot be imported: No module named 'none'"),
-        (["-params", "callback:'json.None'"], "callback cannot be imported: module 'json' has no attribute 'None'"),
+        (
+            ["-params", "env_wrapper:'none.Wrapper'"],
+            "a hyperparameter names what cannot be imported: No module named 'none'",
+        ),
+        (["-params", "callback:'json.None'"], "names what cannot be imported: module 'json' has no attribute 'None'"),
         (["-params", "noise_type:'normal'"], "noise_type=normal needs noise_std: give it too"),
         (["-params", "noise_type:'x'", "noise_std:0.1"], 'noise_type=x: Unknown noise type "x"'),
         (["--env-kwargs", "g:9.0", "-params", "normalize:'dict(clip=1)'"], "normalize=dict.clip=1.: .*'clip'"),
@@ -458,7 +475,7 @@ def test_the_last_checkpoint_of_a_run_that_is_not_finished_is_watched(
     Path("a/Pendulum-v1.zip").unlink()
     last = f"checkpoint-{steps('a')[-1]:012d}"
     assert Path(model_path(Path("a"), "sac_sample", "Pendulum-v1")[1]) == Path("a") / last / "model.zip"
-    assert f"not finished: its last checkpoint, {last}, is taken" in capsys.readouterr().out
+    assert f"not finished: the last one, {last}, is taken" in capsys.readouterr().out
     # That of a run which was interrupted, goes on and has not ended again is older.
     run("--run-dir", "a", "-n", "120", "--eval-freq", "-1")
     assert has_ended(Path("a"))
@@ -466,11 +483,11 @@ def test_the_last_checkpoint_of_a_run_that_is_not_finished_is_watched(
     assert not has_ended(Path("a"))
     assert Path(model_path(Path("a"), "sac_sample", "Pendulum-v1")[1]) == Path("a") / last / "model.zip"
     cli.main([*["enjoy", "--algo", "sac_sample", "--env", "Pendulum-v1", "--no-render", "-n", "5", "--run-dir", "a"]])
-    assert f"its last checkpoint, {last}, is taken" in capsys.readouterr().out
+    assert f"older than its checkpoints: the last one, {last}, is taken" in capsys.readouterr().out
     Path("logs/sac_sample").mkdir(parents=True)
     os.rename("a", "logs/sac_sample/Pendulum-v1_1")
     cli.main([*["enjoy", "--algo", "sac_sample", "--env", "Pendulum-v1", "--no-render", "-n", "5", "-f", "logs"]])
-    assert "Pendulum-v1.zip is older than its run's last checkpoint" in capsys.readouterr().err
+    assert "Pendulum-v1.zip is older than the last checkpoint beside it" in capsys.readouterr().err
     (tmp_path / "b").mkdir()
     with pytest.raises(SystemExit, match="neither a model of a finished run nor a checkpoint"):
         model_path(tmp_path / "b", "sac_sample", "Pendulum-v1")

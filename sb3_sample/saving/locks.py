@@ -89,17 +89,22 @@ def take_folder(folder: Path) -> Lock | None:
 
     :param folder: the folder
     :return: the lock; None where folders cannot be locked (on Windows, and in some network file systems)
+    :raises FileNotFoundError: the folder is not there, or was removed meanwhile
     :raises BlockingIOError: another process has it, on this machine or on another that shares the folder
     """
     if not hasattr(os, "O_DIRECTORY"):
         return None
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    held = temporary.lock(descriptor)
-    if held:
-        return Lock(descriptor)
-    os.close(descriptor)
-    if held is False:
-        raise BlockingIOError(errno.EAGAIN, "another process has locked it", str(folder))
+    with contextlib.ExitStack() as on_return:
+        on_return.callback(os.close, descriptor)
+        held = temporary.lock(descriptor)
+        if held is False:
+            raise BlockingIOError(errno.EAGAIN, "another process has locked it", str(folder))
+        if not os.path.samestat(os.fstat(descriptor), os.stat(folder)):
+            raise FileNotFoundError(errno.ENOENT, "it was replaced while it was locked", str(folder))
+        if held:
+            on_return.pop_all()
+            return Lock(descriptor)
     return None
 
 

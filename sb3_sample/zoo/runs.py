@@ -53,8 +53,6 @@ COMPARED = (
 )  # fmt: skip
 #: Arguments of the zoo on which the trials of a search depend, besides its hyperparameters.
 SEARCHED = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_episodes")
-#: Hyperparameters that name classes to import.
-_IMPORTED = ("env_wrapper", "vec_env_wrapper", "callback")
 #: Hyperparameters from which the zoo makes ``action_noise``.
 _OF_NOISE = {"noise_type", "noise_std"}
 #: Settings that change the observations, and belong to a trained model as its arguments do.
@@ -213,8 +211,7 @@ class Manager(ExperimentManager):
             # Not one of the class's own, when it is made.
             if isinstance(error, AttributeError) and not isinstance(error.obj, ModuleType):
                 raise
-            names = ", ".join(name for name in _IMPORTED if hyperparams.get(name))
-            raise RunError(f"{names or 'a hyperparameter'} cannot be imported: {error}") from error
+            raise RunError(f"a hyperparameter names what cannot be imported: {error}") from error
         if self.optimize_hyperparameters and any(isinstance(each, DiagnosticsCallback) for each in found[2]):
             raise RunError(
                 "callback: DiagnosticsCallback does not go with -optimize, whose trials make no environment for it: "
@@ -263,9 +260,11 @@ class Manager(ExperimentManager):
         if self.algo in ALGORITHMS and self.storage and self.study_name:
             values = {name: getattr(self.args, name) for name in SEARCHED} | self._settings
             values |= {name: getattr(self, name) for name in ("n_timesteps", "n_evaluations")}
-            check_search(
-                self.storage, self.study_name, {name: _spellings(name, value)[0] for name, value in values.items()}
-            )
+            # Objects are written with their place in memory, which means nothing.
+            settings = {
+                name: re.sub(r" at 0x[0-9a-fA-F]+", "", _spellings(name, value)[0]) for name, value in values.items()
+            }
+            check_search(self.storage, self.study_name, settings)
         super().hyperparameters_optimization()
 
     def create_callbacks(self) -> None:
@@ -409,13 +408,19 @@ class RunManager(Manager):
     def _make_folder(self) -> None:
         if self._lock is not None:
             return
-        super()._make_folder()
-        try:
-            self._lock = take_folder(self._folder)
-        except BlockingIOError as error:
-            # What is in the folder is the other's, even if this run has made it.
-            self._has_made_folder = False
-            raise RunError(f"{self._folder} is in use: another process trains in it") from error
+        is_there = False
+        while not is_there:
+            super()._make_folder()
+            try:
+                self._lock = take_folder(self._folder)
+                is_there = True
+            except FileNotFoundError:
+                # A run that had made it was refused, and has removed it.
+                self._has_made_folder = False
+            except BlockingIOError as error:
+                # What is in the folder is the other's, even if this run has made it.
+                self._has_made_folder = False
+                raise RunError(f"{self._folder} is in use: another process trains in it") from error
         if self._start.record is None and all_checkpoints(self._folder):
             raise RunError(
                 f"another process has just trained in {self._folder}: the same command, given again, goes on"

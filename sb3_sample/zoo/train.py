@@ -125,7 +125,8 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     record = Record.read(folder)
     check_monitor_files(folder)
     # Further arguments of the command line replace these.
-    command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
+    # An earlier version took 0 for -1, as many steps as the hyperparameters say.
+    command = ["--seed", str(record.seed), "-n", str(record.n_timesteps or -1), *arguments]
     return Start(command, freq or record.checkpoint_freq, folder, record)
 
 

@@ -16,11 +16,14 @@ import optuna
 import sqlalchemy.engine
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
 
 from sb3_sample.saving.untrusted import BadFile, open_regular
 
 #: Largest size of a line of a journal, in bytes.
 MAX_LINE = 2**20
+#: States of trials with which further ones are compared.
+_COMPARED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
 #: Name under which a study has the settings of its search.
 _SETTINGS = "sb3_sample"
 #: Words in the definition of a table that computes something when it is read; none of Optuna's tables does.
@@ -61,7 +64,7 @@ def check_storage(storage: str) -> None:
 def check_search(storage: str, study_name: str, settings: Mapping[str, str]) -> None:
     """
     Record the settings of a search in its study, or compare them with those of the search that has begun it, since
-    their trials would be compared with each other. Studies without such a record are not checked.
+    their trials would be compared with each other. A study whose trials another program has begun is not checked.
 
     :param storage: as in :func:`stored_params`
     :param study_name: name of the study, made if it is not there
@@ -76,8 +79,10 @@ def check_search(storage: str, study_name: str, settings: Mapping[str, str]) -> 
             storage=_opened(storage), study_name=study_name, load_if_exists=True, direction="maximize"
         )
         before = study.user_attrs.get(_SETTINGS)
-        if before is None and not study.trials:
+        compared = study.get_trials(deepcopy=False, states=_COMPARED)
+        if not compared and before != settings:
             study.set_user_attr(_SETTINGS, dict(settings))
+            return
     if not isinstance(before, dict):
         return
     differences = [

@@ -141,7 +141,7 @@ class _Watch:
                 found = get_model_path(exp_id, folder, algo, env_name, *which)
                 if Path(found[1]).name == f"{env_name}.zip" and not has_ended(Path(found[2])):
                     print(
-                        f"sb3-sample: {found[1]} is older than its run's last checkpoint, which is shown with "
+                        f"sb3-sample: {found[1]} is older than the last checkpoint beside it; for that one give "
                         f"--run-dir {found[2]}",
                         file=sys.stderr,
                     )
@@ -282,11 +282,14 @@ def model_path(
             return of_checkpoint(steps)
     elif load_last_checkpoint and made and not load_best:
         return of_checkpoint(max(made))
-    elif not (load_best or load_last_checkpoint or ((run_dir / f"{env_name}.zip").exists() and has_ended(run_dir))):
-        if not made:
+    elif not (load_best or load_last_checkpoint):
+        has_final = (run_dir / f"{env_name}.zip").exists()
+        if not (has_final or made):
             refuse("", f"{run_dir} has neither a model of a finished run nor a checkpoint")
-        print(f"The run in {run_dir} is not finished: its last checkpoint, {made[max(made)].name}, is taken")
-        return of_checkpoint(max(made))
+        if made and not (has_final and has_ended(run_dir)):
+            why = "has a final model older than its checkpoints" if has_final else "is not finished"
+            print(f"The run in {run_dir} {why}: the last one, {made[max(made)].name}, is taken")
+            return of_checkpoint(max(made))
     try:
         # The zoo adds the algorithm's name to the folder.
         prefix, path, _ = get_model_path(
