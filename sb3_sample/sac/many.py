@@ -20,6 +20,7 @@ from sb3_sample.faults import TrainingDiverged
 from sb3_sample.kinds import SEED, check_value, integer
 from sb3_sample.lockstep import Group, Seat
 from sb3_sample.sac.algorithm import SAC
+from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.interrupts import Interrupts
 from sb3_sample.training.seats import all_made, joint_of
@@ -104,6 +105,19 @@ def train_many(
     models: list[Any] = [None] * len(names)
     diverged: dict[int, TrainingDiverged] = {}
 
+    # Identities of what the learners were given, by argument, and the objects, so that no other takes their place.
+    given: dict[str, tuple[set[int], list[Any]]] = {}
+
+    def apart(argument: str, what: str, do: str, mine: set[int], owner: Any) -> None:
+        theirs, owners = given.setdefault(argument, (set(), []))
+        if mine & theirs:
+            raise ValueError(
+                f"{argument} must make {what} at each call, and gave the same one to two learners, which would {do}: "
+                "pass a function that makes a new one"
+            )
+        theirs |= mine
+        owners.append(owner)
+
     def train(index: int) -> None:
         seed, folder = names[index], folders[index]
         made = _environment(env, n_envs, vec_env_cls)
@@ -112,16 +126,18 @@ def train_many(
             # It may hold the state of a stochastic process, which advances with a learner's steps.
             own["action_noise"] = copy.deepcopy(noise)
         model = models[index] = cls(policy, made, seed=seed, **own)
-        others: list[Any] = [other.env for at, other in enumerate(models) if other is not None and at != index]
-        mine: Any = model.env
-        if not isinstance(env, str) and any(identities(mine) & identities(other) for other in others):
-            raise ValueError(
-                "env must make an environment at each call, and gave the same one to two learners, which would step it "
-                "in turns: pass a function that makes a new one"
-            )
+        own_env: Any = model.env
+        if not isinstance(env, str):
+            apart("env", "an environment", "step it in turns", identities(own_env), own_env)
         callbacks = None if callback is None else callback(index)
+        tops = callbacks if isinstance(callbacks, list) else [callbacks]
+        called = [each for top in tops if isinstance(top, BaseCallback) for _, each in walk(top)]
+        apart("callback", "a callback", "call it at the steps of both", {id(each) for each in called}, called)
         if eval_env is not None:
             evaluation = _evaluation(eval_env, seed, eval_freq, n_eval_episodes, model.n_envs, folder)
+            if not isinstance(eval_env, str):
+                evaluated: Any = evaluation.eval_env
+                apart("eval_env", "an environment", "reset it in turns", identities(evaluated), evaluated)
             callbacks = _with(callbacks, evaluation)
         all_made(model)
         try:

@@ -13,12 +13,6 @@ from sb3_sample.warn import warn
 class UpdateSchedule(DecidesCompiling, UpdatesOwed):
     """Part of an off-policy algorithm, before Stable-Baselines3's class: when it learns, and how many steps at once."""
 
-    def _before_training(self: Any) -> None:
-        """Forget the plan of a ``learn`` that was ended before its first gradient step."""
-        super()._before_training()  # type: ignore[misc]
-        if self._n_updates == 0:
-            self.planned_updates = self.schedule_steps
-
     def _before_turns(self: Any) -> None:
         """
         Plan the gradient steps of the first ``learn``, and decide, with ``compile="auto"`` once and for all, whether
@@ -29,9 +23,14 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
             self._tell_of(self.prior_data)
         checks.check_scale_is_known(self)
         n_steps = self._total_timesteps - self.num_timesteps
+        if self._n_updates == 0:
+            # A ``learn`` that ended before its first gradient step leaves no plan.
+            self.planned_updates = self.schedule_steps
         if self.learning_rate_schedule is not None and self.planned_updates is None:
+            # Of a run that goes on in its warm-up, the steps before count as well.
+            begin = self._num_timesteps_at_start if self._n_updates == 0 else self.num_timesteps
             # Optimizers count their steps over the model's life.
-            coming = round(self._updates_in(n_steps))
+            coming = round(self._updates_in(self._total_timesteps - begin))
             self.planned_updates = self._n_updates + coming if coming else None
             # With a replay ratio of 0, or less than one step in all, a later call that takes some plans them. So does
             # ``train`` itself where ``learn`` is to take none.

@@ -35,6 +35,9 @@ _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
 #: callback also hold the attributes that only the first one has changed.
 _CHANGED: MutableMapping[BaseCallback, set[str]] = WeakIdKeyDictionary()
 
+#: Attributes as they were before this process's first training with checkpoints.
+_FIRST: MutableMapping[BaseCallback, dict[str, Node]] = WeakIdKeyDictionary()
+
 
 def without_progress_bar(callback: BaseCallback) -> BaseCallback:
     """
@@ -102,6 +105,7 @@ class CallbackStates:
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: _each_apart(each) for path, each in self._callbacks.items()}
+        self._first = {path: _FIRST.setdefault(each, self._before[path]) for path, each in self._callbacks.items()}
         # Paths of the callbacks for which a warning was given that something is lost.
         self._told: set[str] = set()
         # Attributes that an earlier part of the run has changed belong to the state as well.
@@ -190,6 +194,10 @@ class CallbackStates:
         kept = [*(f"{type(callback).__name__}.{name}" for name in said), *restorer.kept]
         if kept:
             warn(f"{', '.join(kept)} of the checkpoint may name files, and stay as they are ({path})")
+        # What steps after the checkpoint have changed, if an earlier call in this process took them.
+        for name in self._changed[path] & self._first[path].keys() - attributes.keys():
+            if not same(self._first[path][name], self._before[path].get(name)):
+                Restorer().attributes(callback, {name: self._first[path][name]})
         self._changed[path] |= attributes.keys()
         if state["state"] is not None:
             own_state = callback.state_dict()  # type: ignore[attr-defined]

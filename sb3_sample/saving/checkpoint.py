@@ -120,6 +120,7 @@ class Checkpointer:
         self._left_out: set[str] = set()
         self._whole_at: int | None = None
         self._interrupts: Interrupts | None = None
+        self._states: CallbackStates | None = None
         self._progress: ProgressFile | None = None
         # Completed periods of ``every`` steps at the end of the last turn.
         self._period = 0
@@ -193,6 +194,12 @@ class Checkpointer:
         if self._folder is None:
             return
         try:
+            is_early = self._model.num_timesteps < self._model._total_timesteps
+            if self._seat is not None and (is_early if kind is None else issubclass(kind, Exception)):
+                self._folder.set_left(True)
+            if kind is not None and self._states is not None:
+                # The call may be repeated with the same callbacks, from a checkpoint before these changes.
+                self._states.note_changes()
             if kind is None:
                 self._save_if_whole()
                 _TRAINED.setdefault(self._model, set()).add(os.path.realpath(self._folder.path))
@@ -343,6 +350,7 @@ class Checkpointer:
             self._restore_rest(self._resumed)
             self._resumed = None
             return
+        self._folder.set_left(False)
         try:
             self._save()
         except OSError as error:
@@ -362,11 +370,13 @@ class Checkpointer:
                 "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
                 f"run goes on: {'; '.join(missing)}"
             )
+        assert self._states is not None
         lost = self._states.lost()
         if lost:
             warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}")
 
     def _restore_rest(self, state: dict[str, Any]) -> None:
+        assert self._states is not None
         with self._restoring(state):
             try:
                 reasons = vec_envs.restore(self._env, state["env"])
@@ -484,7 +494,7 @@ class Checkpointer:
             ring.n_written = ring.n_rows
 
     def _save_rest(self, segments: dict[str, Any]) -> None:
-        assert self._folder is not None and self._progress is not None
+        assert self._folder is not None and self._progress is not None and self._states is not None
         model = self._model
         state = {
             "identity": self._identity,

@@ -30,7 +30,7 @@ from sb3_sample.warn import warn
 
 MODEL, STATE, MANIFEST = "model.zip", "state.zip", "manifest.json"
 SEGMENTS, LOG = "replay", "progress.jsonl"
-_LOCK, _WRITING, _REMOVED = ".lock", ".writing", ".removed"
+_LOCK, _LEFT, _WRITING, _REMOVED = ".lock", ".left", ".writing", ".removed"
 _CHECKPOINT = re.compile(r"checkpoint-(\d{12,})")
 #: Folders that will be renamed when complete, or were renamed to be removed. Their number is drawn anew each time, so
 #: that a folder that cannot be removed is not in the way.
@@ -40,7 +40,9 @@ _SEGMENT = re.compile(r"[^\W\d]\w*-\d{12,}-\d{12,}\.zip")
 _HIDDEN_FILE = re.compile(rf"\.({_SEGMENT.pattern}|{re.escape(LOG)}|{re.escape(_LOCK)})\.[0-9a-f]{{12}}")
 #: Names used here, which must not be links; and names that only a run of ours may give to a file or folder that is not
 #: empty.
-_USED = re.compile(rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|{_CHECKPOINT.pattern}|{_HIDDEN.pattern}")
+_USED = re.compile(
+    rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|{re.escape(_LEFT)}|{_CHECKPOINT.pattern}|{_HIDDEN.pattern}"
+)
 _CLAIMED = re.compile(
     rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|checkpoint-.*|({re.escape(_WRITING)}|{re.escape(_REMOVED)})(-.*)?",
     re.DOTALL,
@@ -163,6 +165,19 @@ class RunFolder:
         lock, self._lock = self._lock, None
         if lock is not None:
             lock.release()
+
+    def set_left(self, left: bool) -> None:
+        """
+        Record whether the run has ended before those made together with it, so that these continue without it.
+
+        :param left: whether it has
+        """
+        # Without the record they go back to a checkpoint that all have.
+        with contextlib.suppress(OSError), Folder.at(self.path) as root:
+            if left:
+                os.close(root.descriptor(_LEFT, os.O_WRONLY | os.O_CREAT))
+            elif root.look(_LEFT) is not None:
+                root.remove(_LEFT)
 
     def _warn(self, message: str) -> None:
         """Warn once: the same problem is found again at each checkpoint."""
@@ -423,14 +438,16 @@ class Starts(NamedTuple):
 def common_starts(folders: Iterable[Path]) -> Starts:
     """
     Find where runs that are made together resume: at the newest step of which every run has a whole checkpoint. As long
-    as they are made together, there is such a step (:attr:`RunFolder.beside`). If there is none, the run that is behind
-    has left the others and no longer counts among them.
+    as they are made together, there is such a step (:attr:`RunFolder.beside`). A run that has left the others
+    (:meth:`RunFolder.set_left`) no longer counts among them; nor does the one that is behind if there is no such step.
 
     :param folders: folders of the runs
     :return: where they resume, without runs that have no checkpoint or have left the others
     """
     there = {folder: dict(_paths(folder)) for folder in folders}
     there = {folder: made for folder, made in there.items() if made}
+    # If all have left, they may have done so together.
+    there = {folder: made for folder, made in there.items() if not (folder / _LEFT).exists()} or there
     reasons = []
     while there:
         for steps in sorted(set.intersection(*map(set, there.values())), reverse=True):

@@ -132,6 +132,9 @@ def all_made(model: Any) -> None:
     if seat is not None:
         seat.model, seat.learner, seat.aligned = model, model.learner, _is_aligned(model)
         seat.meet(MADE)
+        # Turns of different lengths have no steps in common either.
+        lengths = {each.model.train_freq for each in seat.group.seats if each.model is not None}
+        seat.aligned = seat.aligned and len(lengths) == 1
 
 
 def _is_aligned(model: Any) -> bool:

@@ -36,10 +36,20 @@ def test_a_learn_that_was_ended_in_the_warm_up_plans_nothing(tmp_path: Path) -> 
     assert SAC.load(tmp_path / "model.zip", env=vec()).learn(15, reset_num_timesteps=False).planned_updates == 30
     assert model.learn(30).planned_updates == 60
     assert model.learner.scheduled_rate == pytest.approx(3e-4 * (1 - model._n_updates / 60)) and model._n_updates > 40
-    # A run that goes on from a checkpoint of the warm-up has its plan.
-    run = sac(**arguments)
-    run.learn(20, checkpoint=tmp_path / "run", callback=lambda *_: run.num_timesteps < 5)
-    assert sac(**arguments).learn(30, checkpoint=tmp_path / "run").planned_updates == 40
+    # A run that goes on from a checkpoint of the warm-up plans all of its steps.
+    for name, steps in ("again", 20), ("longer", 30):
+        run = sac(**arguments)
+        run.learn(20, checkpoint=tmp_path / name, checkpoint_freq=4, callback=lambda *_: run.num_timesteps < 7)  # noqa: B023
+        assert run._n_updates == 0
+        other = sac(**arguments)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert other.learn(steps, checkpoint=tmp_path / name).planned_updates == 2 * steps
+        assert other.num_timesteps == steps and other._num_timesteps_at_start == 0
+    # So does one that has ended there, at a checkpoint.
+    with pytest.warns(UserWarning, match="learn ended without a single gradient step"):
+        sac(**arguments).learn(8, checkpoint=tmp_path / "ended", checkpoint_freq=4)
+    assert sac(**arguments).learn(30, checkpoint=tmp_path / "ended").planned_updates == 60
 
 
 def test_a_learn_without_gradient_steps_plans_nothing() -> None:

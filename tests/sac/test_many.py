@@ -17,7 +17,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC as SB3SAC
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -561,13 +561,28 @@ def test_runs_of_which_one_has_diverged_go_on(tmp_path: Path, joint: Any, whole:
 
 @pytest.mark.parametrize("joint", ["together"], indirect=True)
 def test_a_failure_has_the_others_save(tmp_path: Path, joint: Any, whole: Any) -> None:
-    with pytest.warns(UserWarning, match="has ended by LookupError. The others are saved"), pytest.raises(LookupError):
-        trained(tmp_path, lambda i: Raising() if i == 1 else None)
-    newest = [each[-1] for each in saved(tmp_path)]
-    assert newest[1] == 15
-    assert newest[0] == newest[2] == 16
-    models = trained(tmp_path)
-    assert all(same(learned(model), own) for model, own in zip(models, whole, strict=True))
+    """All go on from there, whatever the checkpoints before."""
+    for folder, every in (tmp_path / "often", 10), (tmp_path / "never", 1000):
+        with pytest.warns(UserWarning, match="has ended by LookupError. The others are s"), pytest.raises(LookupError):
+            trained(folder, lambda i: Raising() if i == 1 else Signal(0, 0), checkpoint_freq=every)
+        assert [each[-1] for each in saved(folder)] == [16, 15, 16]
+        seen: list[int] = []
+        models = trained(folder, lambda i: First(seen), checkpoint_freq=every)  # noqa: B023
+        assert sorted(seen) == [16, 17, 17]
+        assert all(same(learned(model), own) for model, own in zip(models, whole, strict=True))
+
+
+def test_turns_of_different_lengths_go_on_each_from_its_own_checkpoint(tmp_path: Path) -> None:
+    arguments: dict[str, Any] = {"per_learner": {"train_freq": [1, 3, 7]}, "replay_ratio": None}
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "parts", lambda i: Signal(33 if i == 0 else 0, signal.SIGINT), **arguments)
+    newest = [each[-1] for each in saved(tmp_path / "parts")]
+    assert min(newest) >= 33 and all(len(each) <= 2 for each in saved(tmp_path / "parts"))
+    seen: list[int] = []
+    models = trained(tmp_path / "parts", lambda i: First(seen), **arguments)
+    assert sorted(seen) == sorted(steps + 1 for steps in newest)
+    ends = trained(tmp_path / "whole", lambda i: Signal(0, 0), **arguments)
+    assert all(same(learned(model), learned(end)) for model, end in zip(models, ends, strict=True))
 
 
 def write(run: Path, *steps: int, beside: Sequence[Path] = ()) -> list[int]:
@@ -628,3 +643,31 @@ def test_one_environment_for_two_learners_is_refused() -> None:
     for env in (Toy(), vec(2)):
         with pytest.raises(ValueError, match="env must make an environment at each call, and gave the same one to two"):
             train_many(SAC, "MlpPolicy", lambda env=env: env, seeds=[0, 1], total_timesteps=20, **TINY_SAC)
+
+
+def test_what_is_given_to_two_learners_is_refused() -> None:
+    one = Raising()
+    for shared in (one, [Raising(), one], CallbackList([one])):
+        with pytest.raises(ValueError, match="callback must make a callback at each call, and gave the same one to tw"):
+            train_many(
+                SAC,
+                "MlpPolicy",
+                Toy,
+                seeds=[0, 1],
+                total_timesteps=20,
+                callback=lambda i, shared=shared: shared,
+                **TINY_SAC,
+            )
+    evaluated = Toy()
+    with pytest.raises(
+        ValueError, match="eval_env must make an environment at each call, and gave the same one to two"
+    ):
+        train_many(SAC, "MlpPolicy", Toy, seeds=[0, 1], total_timesteps=20, eval_env=lambda: evaluated, **TINY_SAC)
+    # A function is none's own.
+    seen: list[int] = []
+
+    def note(variables: Any, _: Any) -> bool:
+        return not seen.append(variables["self"].seed)  # type: ignore[func-returns-value]
+
+    train_many(SAC, "MlpPolicy", Toy, seeds=[0, 1], total_timesteps=20, callback=lambda i: note, **TINY_SAC)
+    assert seen.count(0) == seen.count(1) == 20

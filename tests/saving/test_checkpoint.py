@@ -10,6 +10,7 @@ import resource
 import signal
 import stat
 import subprocess
+import time
 import warnings
 import zipfile
 from pathlib import Path
@@ -41,7 +42,7 @@ from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normali
 from sb3_sample.saving.run_folder import RunFolder
 from tests.agents import OFF_POLICY, env_of
 from tests.ppo.common import EVERY, tiny
-from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+from tests.sac.common import MAKERS, Toy, bro, differing, sac, state, vec
 from tests.saving.hostile_folders import facts_of, rewritten
 from tests.saving.program import Goal, outcome
 
@@ -235,6 +236,60 @@ def test_a_call_that_was_interrupted_goes_on_with_the_same_model(tmp_path: Path)
     with pytest.raises(KeyboardInterrupt):
         model.learn(40, StopAt(25), checkpoint=tmp_path, **STEPS)
     assert not differing(state(sac().learn(40)), state(model.learn(40, checkpoint=tmp_path, **STEPS)))
+
+
+class Failing(Toy):
+    """Raises once, at a step."""
+
+    left = 1
+
+    def step(self, action: np.ndarray) -> Any:
+        if self.total == 28 and Failing.left:
+            Failing.left -= 1
+            raise OSError("the simulator is gone")
+        return super().step(action)
+
+
+class Counting(BaseCallback):
+    """Counts in its own attributes, and marks the beginning of a training."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[int] = []
+        self.left = 5
+
+    def _on_training_start(self) -> None:
+        self.begun = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        self.seen.append(self.num_timesteps)
+        self.left -= 1
+        return True
+
+
+@pytest.mark.parametrize("every", [1000, 10])
+def test_a_call_is_repeated_with_the_same_callbacks(every: int, tmp_path: Path) -> None:
+    """They are as at the checkpoint, without what the steps after it have changed."""
+
+    def callbacks(folder: Path) -> list[Any]:
+        evaluation = EvalCallback(
+            vec(), n_eval_episodes=1, eval_freq=7, log_path=str(folder), best_model_save_path=str(folder), verbose=0
+        )
+        return [evaluation, Counting()]
+
+    Failing.left = 1
+    same_ones, expected = callbacks(tmp_path / "ours"), callbacks(tmp_path / "theirs")
+    model = sac(DummyVecEnv([lambda: Monitor(Failing())]))
+    with pytest.raises(OSError, match="the simulator is gone"):
+        model.learn(40, same_ones, checkpoint=tmp_path / "run", checkpoint_freq=every)
+    begun = same_ones[1].begun
+    model.learn(40, same_ones, checkpoint=tmp_path / "run", checkpoint_freq=every)
+    sac().learn(40, expected)
+    assert same_ones[1].seen == expected[1].seen == list(range(1, 41)) and same_ones[1].left == -35
+    assert same_ones[1].begun > begun
+    ours, theirs = (np.load(tmp_path / name / "evaluations.npz") for name in ("ours", "theirs"))
+    assert ours["timesteps"].tolist() == theirs["timesteps"].tolist() == [7, 14, 21, 28, 35]
+    assert same_ones[0].best_mean_reward == ours["results"].max()
 
 
 def test_the_training_is_the_same_with_checkpoints_and_without(tmp_path: Path) -> None:
