@@ -3,7 +3,7 @@
 import copy
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +20,6 @@ from sb3_sample.faults import TrainingDiverged
 from sb3_sample.kinds import SEED, check_value, integer
 from sb3_sample.lockstep import Group, Seat
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.interrupts import Interrupts
 from sb3_sample.training.seats import all_made, joint_of
@@ -131,7 +130,7 @@ def train_many(
             apart("env", "an environment", "step it in turns", identities(own_env), own_env)
         callbacks = None if callback is None else callback(index)
         tops = callbacks if isinstance(callbacks, list) else [callbacks]
-        called = [each for top in tops if isinstance(top, BaseCallback) for _, each in walk(top)]
+        called = [each for top in tops for each in _called(top)]
         apart("callback", "a callback", "call it at the steps of both", {id(each) for each in called}, called)
         if eval_env is not None:
             evaluation = _evaluation(eval_env, seed, eval_freq, n_eval_episodes, model.n_envs, folder)
@@ -310,6 +309,17 @@ def _evaluation(env: Any, seed: int, every: int, episodes: int, n_envs: int, fol
     log = None if folder is None else str(folder)
     # EvalCallback counts steps that all environments take together.
     return EvalCallback(venv, n_eval_episodes=episodes, eval_freq=max(every // n_envs, 1), log_path=log, verbose=0)
+
+
+def _called(callback: Any) -> Iterator[BaseCallback]:
+    """A callback, and those that it calls as Stable-Baselines3's do."""
+    if not isinstance(callback, BaseCallback):
+        return
+    yield callback
+    for name in ("callbacks", "callback", "callback_on_new_best"):
+        inside = getattr(callback, name, None)
+        for each in inside if isinstance(inside, list) else [inside]:
+            yield from _called(each)
 
 
 def _with(callbacks: Any, evaluation: EvalCallback) -> list[Any]:

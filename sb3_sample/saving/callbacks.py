@@ -35,8 +35,9 @@ _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
 #: callback also hold the attributes that only the first one has changed.
 _CHANGED: MutableMapping[BaseCallback, set[str]] = WeakIdKeyDictionary()
 
-#: Attributes as they were before this process's first training with checkpoints.
-_FIRST: MutableMapping[BaseCallback, dict[str, Node]] = WeakIdKeyDictionary()
+#: Attributes that this process's trainings have changed, as they were when the first of these began, each with those
+#: that hold the values it refers to; None for attributes that were not there.
+_FIRST: MutableMapping[BaseCallback, dict[str, dict[str, Node] | None]] = WeakIdKeyDictionary()
 
 
 def without_progress_bar(callback: BaseCallback) -> BaseCallback:
@@ -105,7 +106,9 @@ class CallbackStates:
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: _each_apart(each) for path, each in self._callbacks.items()}
-        self._first = {path: _FIRST.setdefault(each, self._before[path]) for path, each in self._callbacks.items()}
+        self._there = {path: vars(each).keys() - () for path, each in self._callbacks.items()}
+        self._start = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
+        self._first = {path: _FIRST.setdefault(each, {}) for path, each in self._callbacks.items()}
         # Paths of the callbacks for which a warning was given that something is lost.
         self._told: set[str] = set()
         # Attributes that an earlier part of the run has changed belong to the state as well.
@@ -141,7 +144,12 @@ class CallbackStates:
     def _note(self, path: str, callback: BaseCallback) -> None:
         before, changed = self._before[path], self._changed[path]
         now = _each_apart(callback, changed)
-        changed |= {name for name, node in now.items() if name not in before or not same(node, before[name])}
+        new = {name for name, node in now.items() if name not in before or not same(node, before[name])}
+        changed |= new
+        described = with_what_they_refer_to(new & before.keys(), self._start[path])
+        for name in new:
+            if name in described or name not in self._there[path]:
+                self._first[path].setdefault(name, described if name in described else None)
 
     def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
         now = self._attributes(callback)[0]
@@ -194,10 +202,6 @@ class CallbackStates:
         kept = [*(f"{type(callback).__name__}.{name}" for name in said), *restorer.kept]
         if kept:
             warn(f"{', '.join(kept)} of the checkpoint may name files, and stay as they are ({path})")
-        # What steps after the checkpoint have changed, if an earlier call in this process took them.
-        for name in self._changed[path] & self._first[path].keys() - attributes.keys():
-            if not same(self._first[path][name], self._before[path].get(name)):
-                Restorer().attributes(callback, {name: self._first[path][name]})
         self._changed[path] |= attributes.keys()
         if state["state"] is not None:
             own_state = callback.state_dict()  # type: ignore[attr-defined]
@@ -205,6 +209,27 @@ class CallbackStates:
         for name, env in environments(callback):
             if name in state["environments"]:
                 _restore_env(env, state["environments"][name], f"{type(callback).__name__}.{name}")
+        self._take_back(path, callback, attributes.keys())
+
+    def _take_back(self, path: str, callback: BaseCallback, restored: Set[str]) -> None:
+        """
+        Give attributes that a checkpoint lacks, since nothing had changed them by then, the values that they had before
+        an earlier call in this process changed them.
+        """
+        lacking = {
+            name: of for name, of in self._first[path].items() if name not in restored and name in vars(callback)
+        }
+        for name in [name for name, of in lacking.items() if of is None]:
+            delattr(callback, name)
+            del lacking[name]
+        # Attributes that were changed together may have values in common.
+        for described in {id(of): of for of in lacking.values()}.values():
+            assert described is not None
+            nodes = {name: node for name, node in described.items() if name not in restored}
+            try:
+                Restorer().attributes(callback, nodes)
+            except DoesNotFit as error:
+                warn(f"{', '.join(nodes)} of {type(callback).__name__} ({path}) cannot be taken back: {error}")
 
 
 def _skipped(callback: BaseCallback) -> Set[str]:

@@ -195,11 +195,14 @@ class Checkpointer:
             return
         try:
             is_early = self._model.num_timesteps < self._model._total_timesteps
-            if self._seat is not None and (is_early if kind is None else issubclass(kind, Exception)):
+            has_left = is_early if kind is None else issubclass(kind, Exception)
+            if self._seat is not None and self._seat.began and has_left:
                 self._folder.set_left(True)
             if kind is not None and self._states is not None:
-                # The call may be repeated with the same callbacks, from a checkpoint before these changes.
-                self._states.note_changes()
+                # The call may be repeated with the same callbacks, from a checkpoint before these changes. What cannot
+                # be described must not hide the error.
+                with contextlib.suppress(Exception):
+                    self._states.note_changes()
             if kind is None:
                 self._save_if_whole()
                 _TRAINED.setdefault(self._model, set()).add(os.path.realpath(self._folder.path))
@@ -346,11 +349,12 @@ class Checkpointer:
         self._warn_of_losses()
         if self._seat is not None:
             self._seat.saves, self._folder.beside = True, self._seat.folders_beside
+        if self._seat is None or not self._seat.alone:
+            self._folder.set_left(False)
         if self._resumed is not None:
             self._restore_rest(self._resumed)
             self._resumed = None
             return
-        self._folder.set_left(False)
         try:
             self._save()
         except OSError as error:

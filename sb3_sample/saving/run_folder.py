@@ -439,15 +439,19 @@ def common_starts(folders: Iterable[Path]) -> Starts:
     """
     Find where runs that are made together resume: at the newest step of which every run has a whole checkpoint. As long
     as they are made together, there is such a step (:attr:`RunFolder.beside`). A run that has left the others
-    (:meth:`RunFolder.set_left`) no longer counts among them; nor does the one that is behind if there is no such step.
+    (:meth:`RunFolder.set_left`) no longer counts among them, unless it stands where they resume; nor does the one that
+    is behind if there is no such step. If all have left, those that have come furthest resume together.
 
     :param folders: folders of the runs
     :return: where they resume, without runs that have no checkpoint or have left the others
     """
     there = {folder: dict(_paths(folder)) for folder in folders}
     there = {folder: made for folder, made in there.items() if made}
-    # If all have left, they may have done so together.
-    there = {folder: made for folder, made in there.items() if not (folder / _LEFT).exists()} or there
+    left = {folder: made for folder, made in there.items() if (folder / _LEFT).exists()}
+    furthest = max((max(made) for made in there.values()), default=0)
+    if len(left) == len(there):
+        left = {folder: made for folder, made in left.items() if max(made) < furthest}
+    there = {folder: made for folder, made in there.items() if folder not in left}
     reasons = []
     while there:
         for steps in sorted(set.intersection(*map(set, there.values())), reverse=True):
@@ -459,6 +463,11 @@ def common_starts(folders: Iterable[Path]) -> Starts:
                 continue
             if reasons:
                 warn(f"{_some(reasons)}. The runs go on from {steps} steps instead.")
+            for folder, made in left.items():
+                with contextlib.suppress(Damaged, OSError):
+                    if max(made) == steps:
+                        RunFolder.verify(made[steps])
+                        there[folder] = made
             return Starts(steps, {folder: made[steps] for folder, made in there.items()})
         del there[min(there, key=lambda folder: max(there[folder]))]
     return Starts(0, {})

@@ -613,6 +613,12 @@ def test_checkpoints_are_kept_until_all_runs_have_newer_ones(tmp_path: Path) -> 
     assert write(tmp_path / "alone", 10, 20, 30) == [20, 30]
 
 
+def mark(run: Path, left: bool) -> None:
+    folder = RunFolder(run)
+    folder.set_left(left)
+    folder.close()
+
+
 def test_where_runs_go_on(tmp_path: Path) -> None:
     x, y, z = (tmp_path / name for name in "xyz")
     assert common_starts([x, y, z]) == (0, {})
@@ -637,6 +643,33 @@ def test_where_runs_go_on(tmp_path: Path) -> None:
     (x / "checkpoint-000000000090" / "model.zip").write_bytes(b"of other kind")
     with pytest.warns(UserWarning, match=r"model.zip is damaged: .*\. The runs go on from 80 steps instead"):
         assert common_starts([x, y]).steps == 80
+
+
+def test_where_runs_go_on_some_of_which_have_left(tmp_path: Path) -> None:
+    x, y, z = (tmp_path / name for name in "xyz")
+
+    def found() -> tuple[int, str]:
+        starts = common_starts([x, y, z])
+        assert all(path.parent == run and path.name.endswith(f"{starts.steps}") for run, path in starts.paths.items())
+        return starts.steps, "".join(sorted(run.name for run in starts.paths))
+
+    write(x, 0, 80)
+    write(y, 0, 100)
+    write(z, 0, 100)
+    assert found() == (0, "xyz")
+    mark(x, True)
+    assert found() == (100, "yz")
+    mark(z, True)
+    # It stands where the others do.
+    assert found() == (100, "yz")
+    write(y, 110)
+    assert found() == (110, "y")
+    # All have left, perhaps together.
+    write(z, 110)
+    mark(y, True)
+    assert found() == (110, "yz")
+    mark(x, False)
+    assert found() == (80, "x")
 
 
 def test_one_environment_for_two_learners_is_refused() -> None:

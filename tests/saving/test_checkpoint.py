@@ -257,6 +257,8 @@ class Counting(BaseCallback):
         super().__init__()
         self.seen: list[int] = []
         self.left = 5
+        self.rng = np.random.default_rng(0)
+        self.sampler = collections.UserList([self.rng])
 
     def _on_training_start(self) -> None:
         self.begun = time.perf_counter()
@@ -264,6 +266,7 @@ class Counting(BaseCallback):
     def _on_step(self) -> bool:
         self.seen.append(self.num_timesteps)
         self.left -= 1
+        self.drawn = (*getattr(self, "drawn", ()), self.rng.random(), self.sampler[0].random())
         return True
 
 
@@ -286,7 +289,7 @@ def test_a_call_is_repeated_with_the_same_callbacks(every: int, tmp_path: Path) 
     model.learn(40, same_ones, checkpoint=tmp_path / "run", checkpoint_freq=every)
     sac().learn(40, expected)
     assert same_ones[1].seen == expected[1].seen == list(range(1, 41)) and same_ones[1].left == -35
-    assert same_ones[1].begun > begun
+    assert same_ones[1].begun > begun and same_ones[1].drawn == expected[1].drawn
     ours, theirs = (np.load(tmp_path / name / "evaluations.npz") for name in ("ours", "theirs"))
     assert ours["timesteps"].tolist() == theirs["timesteps"].tolist() == [7, 14, 21, 28, 35]
     assert same_ones[0].best_mean_reward == ours["results"].max()
