@@ -47,6 +47,9 @@ def test_a_place_that_is_taken_is_refused_before_the_recording(
         with pytest.raises(SystemExit):
             main(["dataset", *source, str(tmp_path / "set"), "--env", "Pendulum-v1"])
         assert "must be new" in capsys.readouterr().err
+        with pytest.raises(SystemExit):
+            main(["dataset", *source, str(tmp_path / "model.zip" / "set"), "--env", "Pendulum-v1"])
+        assert "must be in a folder that can be written to, and" in capsys.readouterr().err
 
 
 def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,8 +120,10 @@ def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
         }.items():  # fmt: skip
             file[name] = values
     monkeypatch.chdir(tmp_path)
-    main(["dataset", "convert", "old.hdf5", "sets/new", "--env", "Pendulum-v1"])
-    assert "11 transitions of 2 episodes written to" in capsys.readouterr().out
+    with pytest.warns(UserWarning, match="1 episodes that terminated have no last observation"):
+        main(["dataset", "convert", "old.hdf5", "sets/new", "--env", "Pendulum-v1"])
+    output = capsys.readouterr().out
+    assert "11 transitions of 2 episodes written to" in output and "(1 steps without a next observation" in output
     rows = Dataset.from_minari("sets/new").rows(slice(None))
     assert Dataset.from_minari(tmp_path / "sets" / "new").fingerprint == Dataset.from_minari("sets/new").fingerprint
     assert rows["rewards"].tolist() == list(range(11)) and rows["actions"].ravel().tolist() == [1.5] * 11

@@ -19,6 +19,7 @@ from sb3_sample.ppo.arguments import check_network_kwargs
 from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 from sb3_sample.saving.kept import Kept
+from sb3_sample.warn import warn
 
 #: Entries of ``dynamics_kwargs``, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
 DYNAMICS_DEFAULTS: dict[str, Any] = {
@@ -195,6 +196,14 @@ class ModelBasedPPO(SimulatedPPO):
             # A model that was never trained has no scales for its losses.
             self.dynamics.scale_by(stored)
         n_new, self._n_new = min(self._n_new, self.transitions.size), 0
+        ends = stored.terminations.sum()
+        # The first ones, so that it is said once.
+        if not self.predict_termination and ends > 0 and self.transitions.recent(n_new).terminations.sum() == ends:
+            warn(
+                "predict_termination=False, and episodes have terminated: simulated rollouts go on where they would "
+                "have ended. Pass predict_termination=True (an environment says by never_terminates that none does, "
+                "and a wrapper around it may make this untrue)"
+            )
         if n_new > 0:
             with torch.no_grad():
                 for name, loss in self.dynamics.losses(self._as_tensors(self.transitions.recent(n_new))).items():

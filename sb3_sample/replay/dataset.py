@@ -287,6 +287,12 @@ class Dataset:
         return int((self._steps.terminations | self._steps.truncations).sum())
 
     @property
+    def n_without_last(self) -> int:
+        """Number of episodes that terminated and whose last observation is not known; no target needs it."""
+        steps = self._steps
+        return int((steps.next_at == steps.at).sum()) if steps.next_observations is None else 0
+
+    @property
     def return_range(self) -> float:
         """
         Largest minus smallest undiscounted return of the episodes, those that are cut off included. Where a next

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_sample.envs.numbers import check_numbers
 from sb3_sample.extras import install
 from sb3_sample.replay import steps as sets
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
@@ -154,6 +155,7 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, 
     if first != n:
         raise ValueError(f"{folder} must have {n} steps, as it says, not {first}")
     sets.check_actions(steps.actions, action_space)
+    check_numbers("observations", observation_space, steps.observations)
     return steps, observation_space, action_space
 
 
@@ -183,7 +185,7 @@ def minari_target(id_or_path: Any) -> tuple[str, Path]:
 
     :param id_or_path: new folder, or an id
     :return: the id, and the new folder of the data, inside that of the data set
-    :raises ValueError: if the target exists already, or an id is also the path of a folder here
+    :raises ValueError: if the target exists already or cannot be made, or an id is also the path of a folder here
     :raises ImportError: if Minari is not installed
     """
     minari = _minari()
@@ -204,6 +206,11 @@ def minari_target(id_or_path: Any) -> tuple[str, Path]:
         name = name if _is_id(name) else f"{name}-v0"
     if folder.exists():
         raise ValueError(f"id_or_path={os.fspath(id_or_path)!r} must be new, but {folder} is there")
+    above = next(path for path in folder.parents if path.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
+        raise ValueError(
+            f"id_or_path={os.fspath(id_or_path)!r} must be in a folder that can be written to, and {above} is none"
+        )
     return name, folder
 
 
@@ -223,6 +230,11 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
         warn(f"Minari's format has no place for columns={data.column_names}: they are not among what is written")
     for key in {"author", "author_email"} & metadata.keys():
         metadata[key] = {metadata[key]} if isinstance(metadata[key], str) else set(metadata[key])
+    if n_repeated := data.n_without_last:
+        warn(
+            f"{n_repeated} episodes that terminated have no last observation, as no next_observations were given: "
+            "Minari's format has one, and the one before it is written in its place"
+        )
     target.parent.mkdir(parents=True, exist_ok=True)
     # Under another name until it is whole.
     folder = target.with_name(f".{target.name}-{secrets.token_hex(8)}")

@@ -66,6 +66,10 @@ def record(
         following, rewards, starts, infos = venv.step(actions)
         for i in range(n_envs):
             ends, info = bool(starts[i]), infos[i]
+            if "worker_died" in info:
+                # The step was not taken; another episode is recorded.
+                under_way[i] = []
+                continue
             step = {
                 "observations": for_each(lambda part, i=i: part[i].copy(), observations),  # type: ignore[misc]
                 "actions": np.array(actions[i]),

@@ -106,7 +106,7 @@ class CallbackStates:
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: _each_apart(each) for path, each in self._callbacks.items()}
-        self._there = {path: vars(each).keys() - () for path, each in self._callbacks.items()}
+        self._there = {path: set(vars(each)) for path, each in self._callbacks.items()}
         self._start = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
         self._first = {path: _FIRST.setdefault(each, {}) for path, each in self._callbacks.items()}
         # Paths of the callbacks for which a warning was given that something is lost.

@@ -20,7 +20,7 @@ from sb3_sample.ppo.arguments import check_action_space
 from sb3_sample.ppo.samples import Rollout, SimulatedSamples, log_prob_of_many
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 from sb3_sample.ppo.spaces import FlatObservations
-from sb3_sample.variance.estimate import Interval, check_counts, jackknife, seeded
+from sb3_sample.variance.estimate import Interval, check_counts, check_same_spaces, jackknife, seeded
 from sb3_sample.variance.returns import Agent
 
 R = TypeVar("R")
@@ -220,8 +220,8 @@ def compare_gradients(
     :param on_estimate: called after each estimate, with the number of estimates so far
     :return: the gradients by method: "PPO", the oracle, "MBMA", "QMA", "MBPO"
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: an argument is out of range, :class:`Agent` rejects the model, or :func:`check_spaces` rejects
-        its spaces
+    :raises ValueError: an argument is out of range, :class:`Agent` rejects the model, :func:`check_spaces` rejects its
+        spaces, or the environment has others
     """
     Agent(model)
     check_spaces(model.observation_space, model.action_space)
@@ -230,6 +230,7 @@ def compare_gradients(
     rng = np.random.default_rng(seed)
     env = _environment(model, make_env)
     try:
+        check_same_spaces(model, env)
         with seeded(model, int(rng.integers(2**31))):
             env.seed(int(rng.integers(2**31)))
             settings: dict[str, Any] = {

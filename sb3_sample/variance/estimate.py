@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from scipy.special import stdtrit
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.envs.states import check_restorable, save_state
 from sb3_sample.kinds import is_integer
@@ -181,10 +182,7 @@ def estimate_components(
                 "make_env must make a new environment each time it is called, not give the same one again: "
                 "returns are sampled in the copies while the rollout waits"
             )
-        for name in ("observation_space", "action_space"):
-            ours, theirs = getattr(model, name), getattr(env, name)
-            if ours != theirs:
-                raise ValueError(f"make_env makes an environment with the {name} {theirs}, but the model has {ours}")
+        check_same_spaces(model, env)
         check_restorable(env, copies[0])
         rng = np.random.default_rng(seed)
         with seeded(model, int(rng.integers(2**31))):
@@ -354,6 +352,18 @@ def check_arguments(
     )
     if max_lag is not None and max_lag >= n_steps:
         raise ValueError(f"max_lag must be below n_steps, which is {n_steps}, not {max_lag}")
+
+
+def check_same_spaces(model: OnPolicyAlgorithm, env: gym.Env | VecEnv) -> None:
+    """
+    :param model: a model
+    :param env: environment that ``make_env`` has made
+    :raises ValueError: it has other spaces than the model
+    """
+    for name in ("observation_space", "action_space"):
+        ours, theirs = getattr(model, name), getattr(env, name)
+        if ours != theirs:
+            raise ValueError(f"make_env makes an environment with the {name} {theirs}, but the model has {ours}")
 
 
 def check_counts(counts: dict[str, tuple[int, int]]) -> None:

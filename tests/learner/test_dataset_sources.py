@@ -104,6 +104,13 @@ def test_numbers_in_minaris_files_are_of_their_space(as_dict: bool, tmp_path: Pa
     found = episode.observations["k"] if as_dict else episode.observations
     assert found.tolist() == [0, 1, 2, 3, 4] and (space["k"] if as_dict else space).contains(found[-1])
     assert_same(data, Dataset.from_minari(tmp_path / "set"))
+    # Those of another program may count from 1.
+    (name,) = (tmp_path / "set" / "data").glob("*.hdf5")
+    with pytest.importorskip("h5py").File(name, "r+") as file:
+        stored = file["episode_0/observations/k"] if as_dict else file["episode_0/observations"]
+        stored[...] = stored[...] + 1
+    with pytest.raises(ValueError, match=r"observations.* must .*5"):
+        Dataset.from_minari(tmp_path / "set")
 
 
 def test_a_buffer_of_discrete_actions_is_refused() -> None:
@@ -352,6 +359,24 @@ def test_record_whole_episodes_of_several_environments() -> None:
         assert np.flatnonzero(rows["terminations"][part]).tolist() == ([3] if length == 4 else [])
         assert np.flatnonzero(rows["truncations"][part]).tolist() == ([] if length == 4 else [2])
     np.testing.assert_array_equal(rows["actions"], rows["observations"][:, :2] / np.float32(10))
+
+
+def test_an_episode_whose_worker_died_is_recorded_again() -> None:
+    class Dies(DummyVecEnv):
+        n_steps = 0
+
+        def step_wait(self) -> Any:
+            observations, rewards, dones, infos = super().step_wait()
+            Dies.n_steps += 1
+            if Dies.n_steps == 6:  # in the second episode, as SupervisedSubprocVecEnv tells
+                last, observations = observations, self.reset()
+                infos = [{"worker_died": "why", "TimeLimit.truncated": True, "terminal_observation": last[0]}]
+                rewards, dones = np.zeros(1, np.float32), np.ones(1, bool)
+            return observations, rewards, dones, infos
+
+    data = record(Linear(), Dies([lambda: Toy(length=4)]), 2)
+    assert [part.stop - part.start for part in data.episodes()] == [4, 4] and Dies.n_steps == 4 + 2 + 4
+    assert data.rows(slice(None))["observations"][:, 0].tolist() == [0, 1, 2, 3] * 2
 
 
 def test_record_closes_the_environment_that_it_makes(monkeypatch: pytest.MonkeyPatch) -> None:

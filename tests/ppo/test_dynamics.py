@@ -1,5 +1,6 @@
 """The learned models, what they learn from, and what is logged of them."""
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -262,6 +263,22 @@ def test_an_environment_can_say_that_it_never_terminates() -> None:
 
     assert tiny(env=Endless(truncate=True)).predict_termination is False
     assert tiny(env=DummyVecEnv([Endless, Toy])).predict_termination is True
+
+
+def test_terminations_that_are_not_predicted_are_warned_of_once() -> None:
+    """A wrapper ends episodes of an environment that says that it never does."""
+
+    class Endless(Toy):
+        never_terminates = True
+
+    model = quiet(tiny(env=Endless()))  # it terminates
+    assert model.predict_termination is False
+    with pytest.warns(UserWarning, match="predict_termination=False, and episodes have terminated") as warned:
+        model.learn(96)
+    assert sum("predict_termination" in str(each.message) for each in warned) == 1 and model.transitions.size > 32
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        quiet(tiny(env=Endless(truncate=True))).learn(32)
 
 
 def test_subprocesses() -> None:

@@ -117,6 +117,8 @@ def test_arguments() -> None:
         compare_gradients(agent(), make, n_simulated=0)
     with pytest.raises(ValueError, match="simulation_horizon .* at least 2, not 1"):
         compare_gradients(agent(), make, simulation_horizon=1)
+    with pytest.raises(ValueError, match="make_env makes an environment with the action_space Box"):
+        compare_gradients(agent(), lambda: gym.wrappers.RescaleAction(make(), -3, 3))
     with pytest.raises(TypeError, match="model must be a PPO or A2C"):
         compare_gradients(SAC("MlpPolicy", make(), buffer_size=1), make)  # type: ignore[arg-type]
 
