@@ -103,7 +103,12 @@ def _of_settings(settings: dict[str, Any], head: Mapping[str, Any], path: Path) 
     algo, env, seed = (head.get(name) for name in ("algo", "env", "seed"))
     if not isinstance(algo, str) or not isinstance(env, str) or not (seed is None or type(seed) is int):
         raise BadFile(f"{path} is no record of a run: algo is {algo!r:.50}, env {env!r:.50}, seed {seed!r:.50}")
-    arguments = {name: value for name, value in settings.items() if name not in _OF_THE_RUN and value is not None}
+    # None is a value as any other, but the command line's ``env_kwargs`` are None if they are not given.
+    arguments = {
+        name: value
+        for name, value in settings.items()
+        if name not in _OF_THE_RUN and not (name == "env_kwargs" and value is None)
+    }
     repeat = _action_repeat(settings)
     if type(repeat) is not int or repeat < 1:
         raise BadFile(f"{path}: action_repeat is {repeat!r:.50}, not a whole number from 1 on")

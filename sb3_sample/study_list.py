@@ -16,6 +16,8 @@ from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 
 #: Entry of the list with runs that are no longer in the plan, by name.
 FORMER = "former"
+#: Stands for the value of an argument that was not given.
+ABSENT: Any = object()
 #: Most bytes of the list.
 MAX_LIST = 2**28
 #: Most characters in one part of a folder's name.
@@ -112,11 +114,13 @@ def part_of_path(name: str) -> str:
 
 def word(value: Any) -> str:
     """
-    :param value: of an argument; None if it was not given
+    :param value: of an argument; :data:`ABSENT` if it was not given
     :return: its text in names of agents; a text that reads as another value, such as "2", is in quotation marks
     """
-    if value is None:
+    if value is ABSENT:
         return "default"
+    if value is None:
+        return "none"
     if not isinstance(value, str):
         return json.dumps(_plain(value))
     try:

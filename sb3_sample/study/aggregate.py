@@ -17,8 +17,9 @@ import pandas as pd
 from sb3_sample.envs.scores import SCORED, Score, score_of
 from sb3_sample.envs.suites import DAC_NAMED
 from sb3_sample.extras import install
+from sb3_sample.run_settings import plain_id
 from sb3_sample.study.table import RUN, plain_texts
-from sb3_sample.study_list import word
+from sb3_sample.study_list import ABSENT, word
 from sb3_sample.warn import warn
 
 #: Scores of tasks without a common score, or in place of it; the other tasks have ``score_of``.
@@ -62,6 +63,8 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
     :raises ValueError: a task has no score, or its runs have not recorded the score's metric
     """
     parts, reasons = _by_task(table, scores)
+    if unknown := sorted({*map(plain_id, scores or {})} - {*table["task"]}):
+        warn(f"scores has {', '.join(unknown)}, of which the table has no run: {', '.join(table['task'].unique())}")
     if reasons:
         raise ValueError(next(iter(reasons.values())))
     if not parts:
@@ -99,7 +102,7 @@ def score_for(task: str, scores: Scores | None = None) -> Score | None:
     :param scores: see :func:`scored`
     :return: its score, if it has one
     """
-    given = (scores or {}).get(task)
+    given = {plain_id(name): score for name, score in (scores or {}).items()}.get(task)
     if given is None:
         return score_of(task)
     return given if isinstance(given, Score) else Score("return", float(given))
@@ -155,7 +158,7 @@ def named_apart(table: pd.DataFrame) -> pd.DataFrame:
         if differing:
             for text in rows["arguments"].unique():
                 arguments = json.loads(text)
-                words = ", ".join(f"{name}={word(arguments.get(name))}" for name in differing)
+                words = ", ".join(f"{name}={word(arguments.get(name, ABSENT))}" for name in differing)
                 names[agent, text] = f"{agent} ({words})"
     if not names:
         return table
@@ -172,8 +175,11 @@ def differing_arguments(runs: pd.DataFrame) -> list[str]:
     for _, texts in runs.groupby("task")["arguments"]:
         found = [json.loads(text) for text in texts.unique()]
         names = set().union(*found)
-        # As texts: true is not 1.
-        differing |= {name for name in names if len({json.dumps(each.get(name), sort_keys=True) for each in found}) > 1}
+        # As texts: true is not 1, and null is not absent.
+        texts_of = (
+            {json.dumps(each[name], sort_keys=True) if name in each else "" for each in found} for name in names
+        )
+        differing |= {name for name, texts in zip(names, texts_of, strict=True) if len(texts) > 1}
     return sorted(differing)
 
 

@@ -32,7 +32,7 @@ from sb3_sample.study.aggregate import (
     scored,
 )
 from sb3_sample.study.table import RUN, plain_texts
-from sb3_sample.study_list import word
+from sb3_sample.study_list import ABSENT, word
 from sb3_sample.warn import warn
 
 #: Evaluations at the end of a run that are averaged (the regularization study, appendix A).
@@ -50,8 +50,6 @@ VARIABLES = (
 )
 #: Patterns of the variables that its regressions use unchanged; the others enter as logarithms.
 LINEAR = ("*dormant*",)
-#: Text for an argument that a run was not given.
-DEFAULT = "default"
 
 
 def final(
@@ -96,7 +94,7 @@ def argument(runs: pd.DataFrame, name: str) -> list[str]:
     """
     :param runs: with columns ``agent`` and ``arguments``
     :param name: of an argument, with a dot for an entry of a dict, ``policy_kwargs.net_arch``; or "agent"
-    :return: its value as text for each row, :data:`DEFAULT` if the run was not given it
+    :return: its value as text for each row, "default" if the run was not given it
     :raises ValueError: no run was given it
     """
     if name == "agent":
@@ -106,14 +104,14 @@ def argument(runs: pd.DataFrame, name: str) -> list[str]:
     for text in runs["arguments"].unique():
         value: Any = json.loads(text)
         for key in [name] if name in value else name.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
+            value = value.get(key, ABSENT) if isinstance(value, dict) else ABSENT
         values[text] = value
-    if all(value is None for value in values.values()):
+    if all(value is ABSENT for value in values.values()):
         known = sorted({key for text in values for key in json.loads(text)})
         raise ValueError(
             f"arguments must be of those of the runs, {', '.join(known) or 'which have none'}, not {name!r}"
         )
-    texts = {text: DEFAULT if value is None else word(value) for text, value in values.items()}
+    texts = {text: word(value) for text, value in values.items()}
     return [texts[text] for text in runs["arguments"]]
 
 

@@ -166,8 +166,8 @@ class _Reader:
             self._check_data(agent, agent.steps or steps, tasks)
         variants = list(self._variants(agents, grid))
         self._check_actions(variants, tasks, env_kwargs)
-        for name in measured:
-            self._check_measured(name, entries[name].value, agents)
+        for name, count in measured.items():
+            self._check_measured(name, count, steps, entries[name].value, agents)
         runs = tuple(
             Run(
                 agent.name,
@@ -413,14 +413,26 @@ class _Reader:
                 if why := why_not_acting(agent.algo, arguments, actions, made_on, has_prior_data):
                     raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
-    def _check_measured(self, name: str, node: yaml.Node, agents: list[_Agent]) -> None:
-        """Check that all agents are of the off-policy family, whose networks the measurements need."""
+    def _check_measured(self, name: str, every: int, steps: int, node: yaml.Node, agents: list[_Agent]) -> None:
+        """
+        Check that all agents are of the off-policy family, whose networks the measurements need, act in an environment,
+        and train that long.
+        """
         from sb3_sample.sac import SAC
 
         for agent in agents:
             if not issubclass(algorithms()[agent.algo].algorithm, SAC):
                 raise self._fail(
                     node, f"{name} is of off-policy agents, and {agent.name!r} is {agent.algo}: leave it out"
+                )
+            if "dataset" in agent.data and "offline_steps" not in agent.data:
+                raise self._fail(
+                    node,
+                    f"{name} is of steps in an environment, and {agent.name!r} learns from data only: leave it out",
+                )
+            if every > (agent.steps or steps):
+                raise self._fail(
+                    node, f"{name} every {every:,} steps is none in the {agent.steps or steps:,} of {agent.name!r}"
                 )
 
     def _groups(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, list[str]]:

@@ -308,9 +308,10 @@ class MultiTaskEvalCallback(EvalCallback):
     def _record(self, task_id: str) -> dict[str, Any]:
         """Record of a task's folder, as the table of runs reads it."""
         model: BaseAlgorithm = self.model
-        return {
-            "algo": type(model).__name__,
-            "env": task_id,
-            "seed": model.seed,
-            "settings": {"n_tasks": repr(len(self.task_ids))},
-        }
+        settings = {"n_tasks": repr(len(self.task_ids))}
+        env: Any = self.eval_env
+        # has_attr first, since get_attr of a missing attribute kills a worker of SubprocVecEnv.
+        repeats = set(env.get_attr("action_repeat")) if env.has_attr("action_repeat") else set()
+        if len(repeats) == 1:  # those of multi_task_env have one for all
+            settings["env_kwargs"] = repr({"action_repeat": int(repeats.pop())})
+        return {"algo": type(model).__name__, "env": task_id, "seed": model.seed, "settings": settings}

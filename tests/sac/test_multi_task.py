@@ -1,5 +1,6 @@
 """Agents of several tasks: what networks read, pace, temperatures by task, files, logs, evaluation by task."""
 
+import functools
 import importlib.util
 import json
 import math
@@ -660,6 +661,19 @@ def test_successes_are_of_each_task(tmp_path: Path) -> None:
     training = multi_task_env(ids, seed=1, env_kwargs={"max_episode_steps": 4})
     make("SAC", training).learn(8, callback=callback)
     assert set(study.read(tmp_path)["metric"]) == {"return", "success_rate"}
+
+
+def test_steps_that_a_study_reads_are_the_simulators(tmp_path: Path) -> None:
+    pytest.importorskip("dm_control")
+    made = functools.partial(
+        multi_task_env, ("dmc/cartpole-balance-v0", "dmc/cartpole-swingup-v0"), env_kwargs={"action_repeat": 250}
+    )
+    callback = MultiTaskEvalCallback(
+        made(seed=9), n_eval_episodes=1, eval_freq=4, log_path=tmp_path, verbose=0, at_start=False
+    )
+    make("SAC", made(seed=0)).learn(8, callback=callback)
+    rows = study.read(tmp_path)
+    assert callback.evaluations_timesteps == [4] and set(rows["step"]) == {1_000}
 
 
 class _Zeros:

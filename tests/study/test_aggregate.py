@@ -241,6 +241,8 @@ def test_tasks_without_a_score_need_the_users() -> None:
     for bad in (0.0, -150, float("nan"), float("inf"), study.Score("return", 1, -float("inf"))):
         with pytest.raises(ValueError, match=r"finite high above the low, .*--score Pendulum-v1=LOW:HIGH"):
             study.aggregate(table, [10], scores={"Pendulum-v1": bad})
+    with pytest.warns(UserWarning, match="scores has Pendulum-v0, of which the table has no run: .*Pendulum-v1"):
+        study.aggregate(table, [10], scores={"sb3_sample:Pendulum-v1": 1.0, "Pendulum-v0": 3.0}, reps=5)
 
 
 def test_returns_do_not_stand_for_success() -> None:

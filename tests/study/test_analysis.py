@@ -2,14 +2,18 @@
 
 import math
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from sb3_sample import study
+from sb3_sample.study.aggregate import differing_arguments, named_apart
 from sb3_sample.study.analysis import argument, final, symlog
-from tests.study.made_up import made_up
+from sb3_sample.study.plan import Run
+from sb3_sample.study.reporting.planned import missing_runs
+from tests.study.made_up import made_up, write_run
 
 pytest.importorskip("rliable.library")
 
@@ -148,6 +152,22 @@ def test_arguments_as_text() -> None:
         [("a", {"p": {"n": [8]}, "q": "x"}, CHEETAH, 0, 1, "return", 1.0), ("a", {}, WALKER, 0, 1, "r", 1.0)]
     )
     assert argument(rows, "p.n") == ["[8]", "default"] and argument(rows, "q") == ["x", "default"]
+
+
+def test_no_value_is_another_than_the_default(tmp_path: Path) -> None:
+    """BRO without quantile critics is n_quantiles=None; by default it has 100."""
+    for name, arguments in (("given", {"n_quantiles": None}), ("not", {})):
+        write_run(tmp_path / name, seed=len(name), arguments=arguments)
+    rows = study.read(tmp_path)
+    assert set(rows["arguments"]) == {'{"n_quantiles": null}', "{}"}
+    assert set(argument(rows, "n_quantiles")) == {"none", "default"}
+    assert differing_arguments(rows) == ["n_quantiles"]
+    assert set(named_apart(rows)["agent"]) == {"bro (n_quantiles=none)", "bro (n_quantiles=default)"}
+    grid = [Run("A", "bro", {"n_quantiles": each}, {"n_quantiles": each}, CHEETAH, 0, 10) for each in (None, 50)]
+    assert [run.label for run in grid] == ["A (n_quantiles=none)", "A (n_quantiles=50)"]
+    there = pd.DataFrame({"agent": ["A"], "arguments": ["{}"], "task": [CHEETAH], "seed": [0]})
+    assert missing_runs(grid, there) == grid
+    assert missing_runs(grid, there.assign(arguments='{"n_quantiles": null}')) == grid[1:]
 
 
 # ---------------------------------------------------------------- correlation

@@ -466,6 +466,11 @@ def test_an_agent_with_failed_runs_is_not_better(tmp_path: Path) -> None:
     text = text_of(written(tmp_path / "r.html", place.path, steps=[3_000]))
     assert "A is ahead of B, without certainty." in text and "better than" not in text
     assert "1 failed run of A is not counted: the comparison favours it." in text
+    # So it is if the source is a folder above, or within.
+    for source in (tmp_path, place.path / "runs"):
+        text = text_of(written(tmp_path / "other.html", source, steps=[3_000]))
+        assert "better than" not in text and "1 failed run of A is not counted: the comparison favours it." in text
+    assert "not counted" not in text_of(written(tmp_path / "other.html", place.path / "runs/B", steps=[3_000]))
     # At a step that it has reached it counts.
     text = text_of(written(tmp_path / "r.html", place.path, steps=[1_000]))
     assert "A is better than B." in text and "not counted" not in text

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from sb3_sample.study.plan import Run
+from sb3_sample.study_list import ABSENT
 
 
 def missing_runs(planned: Sequence[Run], runs: pd.DataFrame) -> list[Run]:
@@ -65,7 +66,7 @@ def _read(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def _values(arguments: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
-    return tuple(_frozen(arguments.get(name)) for name in names)
+    return tuple(_frozen(arguments.get(name, ABSENT)) for name in names)
 
 
 def _fits(planned: Mapping[str, Any], given: Mapping[str, Any]) -> bool:

@@ -12,7 +12,7 @@ import pandas as pd
 from sb3_sample.plots import COLUMNS as CURVE_COLUMNS
 from sb3_sample.plots import Curve, find_runs
 from sb3_sample.run_logs import EVALUATIONS
-from sb3_sample.run_settings import study_of
+from sb3_sample.run_settings import STUDY_RUNS, study_of
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import named_apart
@@ -173,9 +173,14 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     former = {
         folder for folder in folders if (study := study_of(folder)) is not None and listed(study).is_former(folder)
     }
-    if is_study:
-        found.states.append(status(path))
+    for study in [path] if is_study else sorted({each for each in map(study_of, folders) if each is not None}):
+        state = status(study)
+        if not is_study:
+            inside = path.absolute()
+            state.runs = [each for each in state.runs if (study / STUDY_RUNS / each.run.name).is_relative_to(inside)]
+        found.states.append(state)
         found.labels.append(label)
+    if is_study:
         if (path / PLAN).is_file():
             found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
