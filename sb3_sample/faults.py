@@ -200,7 +200,8 @@ class HoldBack(BaseCallback):
             self.callback.n_calls += 1
         self.n_calls += 1
         self.num_timesteps = self.model.num_timesteps
-        return self._each(self.callback, lambda callback: callback.on_step())
+        # Any false value ends a training, NumPy's too.
+        return self._each(self.callback, lambda callback: bool(callback.on_step()))
 
     def _on_step(self) -> bool:
         raise AssertionError("on_step does the work")

@@ -313,6 +313,17 @@ def test_what_a_callback_raises_is_kept_until_the_turn_is_over() -> None:
     assert not hold.has_raised()
 
 
+@pytest.mark.parametrize("answer", [False, np.False_, 0, None])
+def test_any_false_value_ends_a_training(answer: Any, tmp_path: Path) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return True if self.n_calls < 3 else answer
+
+    for name, callback in (("one", Stop()), ("list", CallbackList([Counter(), Stop()]))):
+        assert sac(compile=False).learn(10, callback, checkpoint=tmp_path / name).num_timesteps == 3
+    assert sac(compile=False).learn(10, Stop()).num_timesteps == 3
+
+
 def test_it_calls_as_the_callback_is_called() -> None:
     calls: list[str] = []
 

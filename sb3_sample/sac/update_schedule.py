@@ -22,6 +22,11 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         if self._learns_from is None and self.prior_data is not None:
             self._tell_of(self.prior_data)
         checks.check_scale_is_known(self)
+        if self.replay_ratio is not None and self.gradient_steps != 1:
+            warn(
+                f"gradient_steps={self.gradient_steps} was assigned, and has no effect beside replay_ratio="
+                f"{self.replay_ratio}: assign replay_ratio, or replay_ratio=None too"
+            )
         n_steps = self._total_timesteps - self.num_timesteps
         if self._n_updates == 0:
             # A ``learn`` that ended before its first gradient step leaves no plan.

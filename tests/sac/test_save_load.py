@@ -410,6 +410,17 @@ def test_the_replay_ratio_replaces_stable_baselines3s_arguments(tmp_path: Path) 
     assert kept.replay_ratio is None and kept.train_freq.frequency == 3
 
 
+def test_gradient_steps_that_are_assigned_beside_a_replay_ratio() -> None:
+    model = sac(replay_ratio=2)
+    model.gradient_steps = 8
+    with pytest.warns(UserWarning, match="gradient_steps=8 was assigned, and has no effect beside replay_ratio=2"):
+        model.learn(20)
+    model.replay_ratio = None
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="gradient_steps")
+        assert model.learn(10)._n_updates == 2 * 10 + 8 * 10
+
+
 def test_a_dict_of_stable_baselines3s_sac(tmp_path: Path) -> None:
     """It writes ``use_sde=False`` into the dict that it is given."""
     kwargs = {"net_arch": [8]}
