@@ -102,7 +102,8 @@ def _run(args: argparse.Namespace) -> None:
     data = _recorded(args) if args.command == "record" else _read(args)
     if args.command != "info":
         folder = data.to_minari(args.output)
-        left_out = f" ({data.n_left_out} steps without a next observation left out)" if data.n_left_out else ""
+        steps = f"{data.n_left_out} step{'s' if data.n_left_out > 1 else ''}"
+        left_out = f" ({steps} without a next observation left out)" if data.n_left_out else ""
         print(f"{len(data)} transitions of {data.n_episodes} episodes written to {folder}{left_out}")
     elif args.json:
         print(json.dumps(facts_of(data)))

@@ -120,10 +120,10 @@ def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
         }.items():  # fmt: skip
             file[name] = values
     monkeypatch.chdir(tmp_path)
-    with pytest.warns(UserWarning, match="1 episodes that terminated have no last observation"):
+    with pytest.warns(UserWarning, match="no last observation is known of 1 terminated episode,"):
         main(["dataset", "convert", "old.hdf5", "sets/new", "--env", "Pendulum-v1"])
     output = capsys.readouterr().out
-    assert "11 transitions of 2 episodes written to" in output and "(1 steps without a next observation" in output
+    assert "11 transitions of 2 episodes written to" in output and "(1 step without a next observation" in output
     rows = Dataset.from_minari("sets/new").rows(slice(None))
     assert Dataset.from_minari(tmp_path / "sets" / "new").fingerprint == Dataset.from_minari("sets/new").fingerprint
     assert rows["rewards"].tolist() == list(range(11)) and rows["actions"].ravel().tolist() == [1.5] * 11

@@ -197,7 +197,7 @@ class ModelBasedPPO(SimulatedPPO):
             self.dynamics.scale_by(stored)
         n_new, self._n_new = min(self._n_new, self.transitions.size), 0
         ends = stored.terminations.sum()
-        # The first ones, so that it is said once.
+        # The first ones.
         if not self.predict_termination and ends > 0 and self.transitions.recent(n_new).terminations.sum() == ends:
             warn(
                 "predict_termination=False, and episodes have terminated: simulated rollouts go on where they would "

@@ -232,8 +232,8 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
         metadata[key] = {metadata[key]} if isinstance(metadata[key], str) else set(metadata[key])
     if n_repeated := data.n_without_last:
         warn(
-            f"{n_repeated} episodes that terminated have no last observation, as no next_observations were given: "
-            "Minari's format has one, and the one before it is written in its place"
+            f"no last observation is known of {n_repeated} terminated episode{'s' if n_repeated > 1 else ''}, as no "
+            "next_observations were given: Minari's format has one, and the one before it is written in its place"
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     # Under another name until it is whole.

@@ -349,7 +349,8 @@ class Checkpointer:
         self._warn_of_losses()
         if self._seat is not None:
             self._seat.saves, self._folder.beside = True, self._seat.folders_beside
-        if self._seat is None or not self._seat.alone:
+        # Alone, a run goes on from where it has left.
+        if self._resumed is None or (self._seat is not None and not self._seat.alone):
             self._folder.set_left(False)
         if self._resumed is not None:
             self._restore_rest(self._resumed)

@@ -63,8 +63,6 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
     :raises ValueError: a task has no score, or its runs have not recorded the score's metric
     """
     parts, reasons = _by_task(table, scores)
-    if unknown := sorted({*map(plain_id, scores or {})} - {*table["task"]}):
-        warn(f"scores has {', '.join(unknown)}, of which the table has no run: {', '.join(table['task'].unique())}")
     if reasons:
         raise ValueError(next(iter(reasons.values())))
     if not parts:
@@ -85,6 +83,17 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
             f"{row['step']:,}"
         )
     return found.reset_index(drop=True)
+
+
+def warn_of_unknown(table: pd.DataFrame, scores: Scores | None) -> None:
+    """
+    Warn of scores that are of no task in the table, which have no effect.
+
+    :param table: all that the scores are for
+    :param scores: see :func:`scored`
+    """
+    if unknown := sorted({*map(plain_id, scores or {})} - {*table["task"]}):
+        warn(f"scores has {', '.join(unknown)}, of which the table has no run: {', '.join(table['task'].unique())}")
 
 
 def unscored(table: pd.DataFrame, scores: Scores | None = None) -> dict[str, str]:

@@ -25,6 +25,7 @@ from sb3_sample.study.aggregate import (
     aggregate,
     performance_profiles,
     probability_of_improvement,
+    warn_of_unknown,
 )
 from sb3_sample.study.comparison import chosen_groups, comparison
 
@@ -190,7 +191,8 @@ def _groups(options: argparse.Namespace, table: pd.DataFrame) -> Any:
     return chosen_groups(comparison(options.sources).groups, options.groups, table)
 
 
-def _shared(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def _shared(options: argparse.Namespace, table: pd.DataFrame, *names: str) -> dict[str, Any]:
+    warn_of_unknown(table, dict(options.score))
     return {"scores": dict(options.score), **{name: getattr(options, name) for name in names}}
 
 
@@ -322,7 +324,7 @@ def _run_aggregate(options: argparse.Namespace) -> None:
         if options.improvement and options.common:
             raise ValueError("--common is not of --improvement, which compares each pair on the tasks that both have")
         table = _read(options)
-        groups, shared = _groups(options, table), _shared(options, *_INTERVALS)
+        groups, shared = _groups(options, table), _shared(options, table, *_INTERVALS)
         if options.improvement:
             found = probability_of_improvement(table, options.steps[0], groups, **shared)
         elif options.profile:
@@ -355,7 +357,7 @@ def _run_marginalize(options: argparse.Namespace) -> None:
     with refusing("study marginalize"):
         table = _read(options)
         factors = comparison(options.sources).factors if options.factors is None else dict(options.factors)
-        shared = _shared(options, "by", "last", *_INTERVALS)
+        shared = _shared(options, table, "by", "last", *_INTERVALS)
         found = analysis.marginalize(table, factors or None, options.order, groups=_groups(options, table), **shared)
         _put(found, options.output)
 
@@ -384,7 +386,7 @@ def _run_correlate(options: argparse.Namespace) -> None:
         ):
             raise ValueError("--regress is task by task, a table: it has no --by, no --groups and no picture")
         table = _read(options, *options.metrics)
-        shared = _shared(options, "last")
+        shared = _shared(options, table, "last")
         if options.regress:
             _put(analysis.regress(table, options.metrics, **shared), options.output)
             return
@@ -415,7 +417,7 @@ def _run_heatmap(options: argparse.Namespace) -> None:
         if isinstance(chosen, dict) and not chosen:
             raise ValueError(f"group must have a task of the runs, and {options.group!r} has none")
         group = chosen[options.group] if isinstance(chosen, dict) else options.group
-        shared = _shared(options, "value", "step")
+        shared = _shared(options, table, "value", "step")
         found = analysis.heatmap(table, options.x, options.y, group=group, **shared)
         shown = found.reset_index().rename(columns={options.y: f"{options.y} \\ {options.x}"})
         print(f"At {found.attrs['step']:,} simulator steps:\n")
@@ -431,8 +433,8 @@ def _add_cost(parser: argparse.ArgumentParser) -> None:
 
 def _run_cost(options: argparse.Namespace) -> None:
     with refusing("study cost"):
-        shared = _shared(options, "common", *_INTERVALS)
         table = _read(options)
+        shared = _shared(options, table, "common", *_INTERVALS)
         found = analysis.cost(table, options.steps, _groups(options, table), **shared)
         _put(found, options.output, lambda: _draw_cost(found))
 

@@ -415,8 +415,8 @@ class _Reader:
 
     def _check_measured(self, name: str, every: int, steps: int, node: yaml.Node, agents: list[_Agent]) -> None:
         """
-        Check that all agents are of the off-policy family, whose networks the measurements need, act in an environment,
-        and train that long.
+        Check that all agents are of the off-policy family, whose networks the measurements need, and that one of them
+        acts in an environment for so long.
         """
         from sb3_sample.sac import SAC
 
@@ -425,15 +425,10 @@ class _Reader:
                 raise self._fail(
                     node, f"{name} is of off-policy agents, and {agent.name!r} is {agent.algo}: leave it out"
                 )
-            if "dataset" in agent.data and "offline_steps" not in agent.data:
-                raise self._fail(
-                    node,
-                    f"{name} is of steps in an environment, and {agent.name!r} learns from data only: leave it out",
-                )
-            if every > (agent.steps or steps):
-                raise self._fail(
-                    node, f"{name} every {every:,} steps is none in the {agent.steps or steps:,} of {agent.name!r}"
-                )
+        acting = [agent for agent in agents if "dataset" not in agent.data or "offline_steps" in agent.data]
+        most = max((agent.steps or steps for agent in acting), default=0)
+        if every > most:
+            raise self._fail(node, f"{name} every {every:,} steps is none in the {most:,} of an agent's environment")
 
     def _groups(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, list[str]]:
         if "groups" not in entries:

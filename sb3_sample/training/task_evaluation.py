@@ -311,7 +311,8 @@ class MultiTaskEvalCallback(EvalCallback):
         settings = {"n_tasks": repr(len(self.task_ids))}
         env: Any = self.eval_env
         # has_attr first, since get_attr of a missing attribute kills a worker of SubprocVecEnv.
-        repeats = set(env.get_attr("action_repeat")) if env.has_attr("action_repeat") else set()
-        if len(repeats) == 1:  # those of multi_task_env have one for all
-            settings["env_kwargs"] = repr({"action_repeat": int(repeats.pop())})
+        repeats = env.get_attr("action_repeat") if env.has_attr("action_repeat") else [1]
+        # Those of multi_task_env have one for all.
+        if all(type(each) is int and each == repeats[0] for each in repeats) and repeats[0] > 1:
+            settings["env_kwargs"] = repr({"action_repeat": repeats[0]})
         return {"algo": type(model).__name__, "env": task_id, "seed": model.seed, "settings": settings}

@@ -9,7 +9,7 @@ import pytest
 
 from sb3_sample import study
 from sb3_sample.envs.scores import score_of
-from sb3_sample.study.aggregate import iqm, scored
+from sb3_sample.study.aggregate import iqm, scored, warn_of_unknown
 from sb3_sample.study.analysis import argument
 from tests.study.made_up import made_up
 
@@ -241,8 +241,12 @@ def test_tasks_without_a_score_need_the_users() -> None:
     for bad in (0.0, -150, float("nan"), float("inf"), study.Score("return", 1, -float("inf"))):
         with pytest.raises(ValueError, match=r"finite high above the low, .*--score Pendulum-v1=LOW:HIGH"):
             study.aggregate(table, [10], scores={"Pendulum-v1": bad})
+    by_prefix = study.aggregate(
+        table, [10], scores={"sb3_sample:Pendulum-v1": study.Score("return", -150, -1_200)}, reps=5
+    )
+    assert by_prefix.equals(found)
     with pytest.warns(UserWarning, match="scores has Pendulum-v0, of which the table has no run: .*Pendulum-v1"):
-        study.aggregate(table, [10], scores={"sb3_sample:Pendulum-v1": 1.0, "Pendulum-v0": 3.0}, reps=5)
+        warn_of_unknown(table, {"sb3_sample:Pendulum-v1": 1.0, "Pendulum-v0": 3.0})
 
 
 def test_returns_do_not_stand_for_success() -> None:

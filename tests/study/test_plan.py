@@ -86,7 +86,7 @@ def test_a_plan_whose_runs_measure_their_networks(plan_of, entry: str, callback:
     assert run.command(Path("x"))[-3:] == ["learning_starts:500", "replay_ratio:1", f"callback:{callback}"]
     assert Run.of_json(run.as_json()) == run and run.kind == plan_of(GOOD).runs[0].kind
     assert entry not in plan_of(GOOD).runs[0].as_json()
-    with pytest.raises(PlanError, match=f"line 14: {entry} every 100,001 steps is none in the 100,000 of 'SAC'"):
+    with pytest.raises(PlanError, match=f"line 14: {entry} every 100,001 steps is none in the 100,000 of an ag"):
         plan_of(f"{GOOD}{entry}: 100_001\n")
     with pytest.raises(PlanError, match=f"line 14: {entry} must be a whole number of at least 1, not 0"):
         plan_of(f"{GOOD}{entry}: 0\n")

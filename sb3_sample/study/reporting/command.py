@@ -8,7 +8,7 @@ from sb3_sample.envs.scores import Score
 from sb3_sample.plots import PUBLISHED
 from sb3_sample.saving.temporary import becoming
 from sb3_sample.study import table as tables
-from sb3_sample.study.aggregate import REPS, Groups, Scores, check_samples
+from sb3_sample.study.aggregate import REPS, Groups, Scores, check_samples, warn_of_unknown
 from sb3_sample.study.analysis_command import add_intervals, add_runs, add_scores, refusing, steps_of
 from sb3_sample.study.reporting import html
 from sb3_sample.study.reporting import markdown as markdown_pages
@@ -80,6 +80,7 @@ def report(
         raise ValueError("pictures are those of markdown, which is not given")
     of_runs = laws if laws is None or isinstance(laws, Laws) else read_laws(laws)
     gathered = gather(folders, published, plan)
+    warn_of_unknown(gathered.table, scores)
     gathered.scored_by = tuple(each.metric for each in (scores or {}).values() if isinstance(each, Score))
     found = build(
         gathered,

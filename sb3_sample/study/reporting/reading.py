@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -20,8 +20,8 @@ from sb3_sample.study.plan import Run
 from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.reporting.planned import missing_runs
-from sb3_sample.study.runs import LIST, PLAN, checkpointed
-from sb3_sample.study.states import Status, status
+from sb3_sample.study.runs import LIST, PLAN, StudyError, checkpointed
+from sb3_sample.study.states import FAILED, Status, status
 from sb3_sample.study_list import read_list
 
 #: Path of runs, or a table of them.
@@ -113,6 +113,7 @@ def gather(
     found = Gathered([], [], none, none[tables.RUN], [], [], {}, [], {}, [], [], [])
     parts: list[pd.DataFrame] = []
     paths: list[str | Path] = []
+    within: dict[tuple[Path, str | None], list[Path]] = {}
     for source in given:
         if isinstance(source, pd.DataFrame):
             found.names.append("a table")
@@ -120,7 +121,8 @@ def gather(
             parts.append(source)
             continue
         found.names.append(str(source))
-        paths += _paths(source, found)
+        paths += _paths(source, found, within)
+    _add_failed(within, found)
     if plan is not None:
         found.planned = list(read_plan(plan).runs)
         agents = dict.fromkeys(run.agent for run in found.planned)
@@ -153,8 +155,32 @@ def gather(
     return found
 
 
-def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
-    """Runs of a source (of a study only evaluated ones); adds its state and how its runs were made to ``found``."""
+def _add_failed(within: Mapping[tuple[Path, str | None], Sequence[Path]], found: Gathered) -> None:
+    """
+    Add the states of studies whose folders are no sources themselves, but above or below them, if runs there have
+    failed.
+
+    :param within: the sources' folders, by the study and their label
+    :param found: is added to
+    """
+    for (study, label), folders in sorted(within.items(), key=str):
+        try:
+            state = status(study)
+        except (OSError, StudyError) as error:
+            found.notes.append(f"Whether runs of {study} have failed is not known: {error}")
+            continue
+        places = [(each, study / STUDY_RUNS / each.run.name) for each in state.runs]
+        state.runs = [each for each, place in places if any(place.is_relative_to(folder) for folder in folders)]
+        if state.of(FAILED):
+            found.states.append(state)
+            found.labels.append(label)
+
+
+def _paths(source: str | Path, found: Gathered, within: dict[tuple[Path, str | None], list[Path]]) -> list[str | Path]:
+    """
+    Runs of a source (of a study only evaluated ones); adds its state and how its runs were made to ``found``, and its
+    folder to those of ``_add_failed`` if it is no study's.
+    """
     label, path = tables.labelled(source)
     found.titles.append(label or (path.stem if path.is_file() else path.resolve().name))
     if path.is_file():
@@ -173,14 +199,11 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     former = {
         folder for folder in folders if (study := study_of(folder)) is not None and listed(study).is_former(folder)
     }
-    for study in [path] if is_study else sorted({each for each in map(study_of, folders) if each is not None}):
-        state = status(study)
-        if not is_study:
-            inside = path.absolute()
-            state.runs = [each for each in state.runs if (study / STUDY_RUNS / each.run.name).is_relative_to(inside)]
-        found.states.append(state)
-        found.labels.append(label)
+    for study in {each for each in map(study_of, folders) if each is not None} if not is_study else ():
+        within.setdefault((study, label), []).append(path.absolute())
     if is_study:
+        found.states.append(status(path))
+        found.labels.append(label)
         if (path / PLAN).is_file():
             found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
