@@ -583,8 +583,9 @@ class Learner(Executable):
                     f"{type(scaler).__name__} scales rewards by returns, and this learner was told of no step: call "
                     "its on_step at those of the environments, or pass reward_scale=None, or 'linear'"
                 )
-            norm, is_checked, self._checked_statistics = self.observation_norm, self._checked_statistics, True
-            if norm is not None and not is_checked and norm.count < 1:
+            norm = None if self._checked_statistics else self.observation_norm
+            self._checked_statistics = True
+            if norm is not None and norm.count < 1:
                 warn(
                     "normalize_observations=True has no effect, as this learner was shown no observations: call its "
                     "on_observations before each action and on_step after it, or learner.observation_norm.update with "

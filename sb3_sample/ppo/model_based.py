@@ -196,9 +196,9 @@ class ModelBasedPPO(SimulatedPPO):
             # A model that was never trained has no scales for its losses.
             self.dynamics.scale_by(stored)
         n_new, self._n_new = min(self._n_new, self.transitions.size), 0
-        ends = stored.terminations.sum()
+        ends = 0 if self.predict_termination else stored.terminations.sum()
         # The first ones.
-        if not self.predict_termination and ends > 0 and self.transitions.recent(n_new).terminations.sum() == ends:
+        if ends > 0 and self.transitions.recent(n_new).terminations.sum() == ends:
             warn(
                 "predict_termination=False, and episodes have terminated: simulated rollouts go on where they would "
                 "have ended. Pass predict_termination=True (an environment says by never_terminates that none does, "

@@ -174,7 +174,7 @@ class Manager(ExperimentManager):
         try:
             hyperparams, saved = super().read_hyperparameters()
         except (OSError, ImportError, AttributeError, yaml.YAMLError) as error:
-            if isinstance(error, AttributeError) and not isinstance(error.obj, ModuleType):
+            if _is_of_an_object(error):
                 raise
             raise RunError(f"--conf-file {self.config} cannot be read: {' '.join(str(error).split())}") from error
         self._settings = saved
@@ -208,8 +208,7 @@ class Manager(ExperimentManager):
         except (SyntaxError, NameError) as error:
             raise RunError(f"a hyperparameter that is a text of Python is none: {error}") from error
         except (ImportError, AttributeError) as error:
-            # Not one of the class's own, when it is made.
-            if isinstance(error, AttributeError) and not isinstance(error.obj, ModuleType):
+            if _is_of_an_object(error):
                 raise
             raise RunError(f"a hyperparameter names what cannot be imported: {error}") from error
         if self.optimize_hyperparameters and any(isinstance(each, DiagnosticsCallback) for each in found[2]):
@@ -408,17 +407,16 @@ class RunManager(Manager):
     def _make_folder(self) -> None:
         if self._lock is not None:
             return
-        is_there = False
-        while not is_there:
+        while True:
             super()._make_folder()
             try:
                 self._lock = take_folder(self._folder)
-                is_there = True
+                break
             except FileNotFoundError:
                 # A run that had made it was refused, and has removed it.
                 self._has_made_folder = False
             except BlockingIOError as error:
-                # What is in the folder is the other's, even if this run has made it.
+                # Content of the folder is the other's, even if this run has made it.
                 self._has_made_folder = False
                 raise RunError(f"{self._folder} is in use: another process trains in it") from error
         if self._start.record is None and all_checkpoints(self._folder):
@@ -521,6 +519,11 @@ def _make_numbered(parent: str, name: str) -> str:
         with contextlib.suppress(FileExistsError):
             os.makedirs(folder)
             return folder
+
+
+def _is_of_an_object(error: Exception) -> bool:
+    """Whether an attribute is missing that is not a module's: no import has failed, but code that was imported."""
+    return isinstance(error, AttributeError) and not isinstance(error.obj, ModuleType)
 
 
 def _spellings(name: str, value: Any) -> list[str]:
