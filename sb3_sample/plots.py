@@ -9,7 +9,7 @@ import functools
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -165,32 +165,29 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
 # ---------------------------------------------------------------- runs
 
 
-def _folders(path: Path) -> Iterator[Path]:
-    """The folder and all below it; links are not followed, and the depth is not limited."""
-    waiting = [path] if path.is_dir() else []
-    while waiting:
-        folder = waiting.pop()
-        yield folder
-        with os.scandir(folder) as entries:
-            waiting += [Path(entry) for entry in entries if entry.is_dir(follow_symlinks=False)]
-
-
 def _is_run(folder: Path) -> bool:
     return (folder / EVALUATIONS).exists() or bool(monitor_files(folder))
 
 
 def find_runs(path: Path) -> list[Path]:
     """
-    :param path: a run's folder, or a folder with such folders at any depth
-    :return: the folders of runs: those with ``evaluations.npz`` or Monitor files
+    :param path: a run's folder, or a folder with such folders at any depth; links are not followed
+    :return: the folders of runs: those with ``evaluations.npz`` or Monitor files. A run's subfolders, such as copies of
+        its files or Monitor files of its evaluations, are no further runs
     :raises ValueError: there are none
     """
-    folders = {folder for folder in _folders(path) if _is_run(folder)}
-    if path in folders:
-        return [path]
-    if not folders:
+    runs = []
+    waiting = [path] if path.is_dir() else []
+    while waiting:
+        folder = waiting.pop()
+        if _is_run(folder):
+            runs.append(folder)
+            continue
+        with os.scandir(folder) as entries:
+            waiting += [Path(entry) for entry in entries if entry.is_dir(follow_symlinks=False)]
+    if not runs:
         raise ValueError(f"runs must be folders with an evaluations.npz or Monitor files in or below them, not {path}")
-    return sorted(folders, key=lambda folder: (len(folder.name), str(folder)))
+    return sorted(runs, key=lambda folder: (len(folder.name), str(folder)))
 
 
 def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:

@@ -92,6 +92,14 @@ def test_runs_are_found_however_deep_they_lie_and_not_through_links(tmp_path: Pa
     assert plots.find_runs(tmp_path) == [folder]
 
 
+def test_what_lies_within_a_run_is_no_other_run(tmp_path: Path) -> None:
+    folder = tmp_path / "CrossQ" / "seed_0"
+    for name in (".", "states/9000", "eval"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        write_monitor(folder / name / "0.monitor.csv", 1.0, "1,2,3\n")
+    assert plots.find_runs(tmp_path) == plots.find_runs(folder) == [folder]
+
+
 def test_a_run_does_not_choose_which_picture_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("run").mkdir()
