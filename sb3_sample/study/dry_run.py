@@ -215,7 +215,7 @@ def measure(run: Run, threads: int, device: str) -> Cost:
         try:
             found = json.loads(times.read_text())
         except FileNotFoundError as error:
-            raise MeasurementFailed(run.title, done.stdout[-2000:] + done.stderr[-2000:]) from error
+            raise MeasurementFailed(run.title, done.stdout[-10_000:] + done.stderr[-10_000:]) from error
         return Cost(found["seconds"] / found["steps"], _bytes(place), found["bytes_of_step"])
 
 

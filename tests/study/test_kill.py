@@ -124,12 +124,29 @@ def test_killed_studies_end_where_an_undisturbed_one_does(tmp_path: Path) -> Non
     assert not np.array_equal(dict(outcome(whole, 3))["results"], dict(outcome(whole, 4))["results"])
 
 
-def test_what_a_run_refuses_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+BROKEN = """\
+import gymnasium as gym
+from gymnasium.envs.classic_control import PendulumEnv
+
+class Broken(PendulumEnv):
+    def step(self, action):
+        raise RuntimeError("the cable is off")
+
+gym.register("Broken-v0", Broken, max_episode_steps=200)
+"""
+
+
+def test_a_failed_run_is_named_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, folder = tmp_path / "plan.yml", tmp_path / "study"
-    plan.write_text(PLAN.replace("[Pendulum-v1]", "[CartPole-v1, Pendulum-v1]").replace("[3, 4]", "[3]"))
+    (tmp_path / "robots_of_ones_own.py").write_text(BROKEN)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    plan.write_text(
+        "gym_packages: [robots_of_ones_own]\n"
+        + PLAN.replace("[Pendulum-v1]", "[Broken-v0, Pendulum-v1]").replace("[3, 4]", "[3]")
+    )
     scheduler = start(plan, folder, "--retries", "0")
     said = scheduler.communicate(timeout=500)[0]
-    assert scheduler.returncode == 1
+    assert scheduler.returncode == 1, said
     assert "1 done, 0 running, 1 failed, 0 waiting" in said
-    assert "failed after 1 attempt: SAC on CartPole-v1, seed 3\n    Traceback" in said and "Discrete" in said
+    assert "failed after 1 attempt: SAC on Broken-v0, seed 3\n    Traceback" in said and "the cable is off" in said
     assert (folder / "runs/SAC/Pendulum-v1/3/Pendulum-v1.zip").exists()

@@ -299,10 +299,10 @@ def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFi
     # No digit is lost, in values or names.
     rates = (1.2345678e-4, 1.2345679e-4, 3e-5)
     command[6:9] = ["0.3333333", "2"]
-    cli.main([*command, "--measure", "1234567", "--batch-sizes", "64", "--learning-rates", *map(repr, rates)])
+    cli.main([*command, "--measure", "12345", "--batch-sizes", "64", "--learning-rates", *map(repr, rates)])
     runs = study.read_plan(path).runs
     assert {run.arguments["learning_rate"] for run in runs} == set(rates)
-    assert {run.grid["replay_ratio"] for run in runs} == {0.3333333, 2} and {run.measure for run in runs} == {1_234_567}
+    assert {run.grid["replay_ratio"] for run in runs} == {0.3333333, 2} and {run.measure for run in runs} == {12_345}
     assert {run.agent for run in runs} == {"bro B64 lr0.00012345678", "bro B64 lr0.00012345679", "bro B64 lr3e-05"}
     path.unlink()
     with pytest.raises(SystemExit):
