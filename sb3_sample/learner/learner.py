@@ -43,6 +43,7 @@ from sb3_sample.learner.reward_scale import RewardScale, task_of
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.networks.batch_norm import BatchNorm
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.projected import Projected
@@ -565,11 +566,32 @@ class Learner(Executable):
             unless transforms draw for the transitions of ``extra``, always by torch's generator
         :param extra: further transitions for a rule of pessimism that learns from some, from its ``draw``
         :return: what to log, by name, scalars on the learner's device
-        :raises ValueError: if ``batch`` is not a batch
+        :raises ValueError: if ``batch`` is not a batch, or has too few transitions for batch norm
         """
         check_is_batch(batch)
+        self.check_rows(len(batch.rewards), "transitions of a batch")
         with self._updating():
             return self.step(batch, noise, extra)
+
+    def check_rows(self, n: int, name: str) -> None:
+        """
+        Check that a batch is large enough, before anything has learned from it: the critics may see twice its rows, and
+        would have taken their step when the actor's batch norm refuses it.
+
+        :param n: transitions of a batch
+        :param name: what the message calls them
+        :raises ValueError: one transition, of which batch norm can take no variance
+        """
+        if n >= 2:
+            return
+        for network, is_stacked in (
+            (self.critic, self.critic.trunk.stacks_rows is not None),
+            (self.actor, self.actor.trunk.stacks_actor_rows),
+        ):
+            if not is_stacked and any(isinstance(layer, BatchNorm) for layer in network.modules()):
+                raise ValueError(
+                    f"{name} must be at least 2 with batch norm, which takes mean and variance of the batch, not {n}"
+                )
 
     @contextmanager
     def _updating(self) -> Iterator[None]:

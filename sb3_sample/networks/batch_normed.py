@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
+from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer, one_of
 from sb3_sample.networks.batch_norm import BatchNorm, BatchRenorm
 from sb3_sample.networks.ensemble import Dense
 from sb3_sample.networks.initialization import linear
@@ -29,22 +29,25 @@ class BatchNormedMLP(Network):
         n_copies: int | None,
         bias: bool,
         unit_norm: bool,
+        kernels: str = "orthogonal",
     ) -> None:
         self.input_norm, *of_layers = norms
         self.dense = nn.ModuleList()
         for width in hidden_sizes:
-            layer = linear(in_features, width, n_copies, bias=bias, unit_norm=unit_norm)
+            layer = linear(in_features, width, n_copies, bias=bias, unit_norm=unit_norm, kernels=kernels)
             if isinstance(layer, UnitNorm):
                 layer.joint_bias = bias
             self.dense.append(layer)
             in_features = width
         self.norms = nn.ModuleList(of_layers)
         self.activations = nn.ModuleList(activation_fn() for _ in hidden_sizes)
-        self.out_features, self.has_unit_norm = in_features, unit_norm
+        self.out_features, self.has_unit_norm, self.kernels = in_features, unit_norm, kernels
 
     def make_head(self, n_outputs: int, n_copies: int | None = None, gain: float | None = None) -> nn.Module:
         gain = self.head_gain if gain is None else gain
-        return linear(self.out_features, n_outputs, n_copies, gain=gain, unit_norm=self.has_unit_norm)
+        return linear(
+            self.out_features, n_outputs, n_copies, gain=gain, unit_norm=self.has_unit_norm, kernels=self.kernels
+        )
 
     def project(self) -> None:
         if self.has_unit_norm:
@@ -84,6 +87,8 @@ class CrossQNet(BatchNormedMLP):
     :param weight_norm: whether units have weights of length 1
     :param renorm_warm_up: training passes of batch norm before batch renormalisation; None: batch norm throughout
     :param unbiased: whether variances are unbiased, as in sb3_contrib, and not biased, as in the published code
+    :param kernels: distribution of the kernels at initialisation, the output layer's included: "orthogonal", or
+        "lecun_normal" as in the published code of CrossQ
     :param eps: added to the variance
     :param momentum: share of the batch in the running moments, in (0, 1]
     :param n_copies: E for E independent networks, None for one
@@ -98,6 +103,7 @@ class CrossQNet(BatchNormedMLP):
         weight_norm: bool = False,
         renorm_warm_up: int | None = 100_000,
         unbiased: bool = True,
+        kernels: str = "orthogonal",
         eps: float = 1e-3,
         momentum: float = 0.01,
         n_copies: int | None = None,
@@ -107,6 +113,7 @@ class CrossQNet(BatchNormedMLP):
         check_value("weight_norm", weight_norm, TRUE_OR_FALSE)
         check_value("renorm_warm_up", renorm_warm_up, integer(0).or_none("batch norm"))
         check_value("unbiased", unbiased, TRUE_OR_FALSE)
+        check_value("kernels", kernels, one_of(("orthogonal", "lecun_normal")))
 
         def norm(width: int) -> BatchNorm:
             if renorm_warm_up is None:
@@ -114,7 +121,9 @@ class CrossQNet(BatchNormedMLP):
             return BatchRenorm(width, n_copies, eps, momentum, unbiased, renorm_warm_up)
 
         norms = [norm(width) for width in (in_features, *hidden_sizes)]
-        self._make(in_features, hidden_sizes, activation_fn, norms, n_copies, bias=True, unit_norm=weight_norm)
+        self._make(
+            in_features, hidden_sizes, activation_fn, norms, n_copies, bias=True, unit_norm=weight_norm, kernels=kernels
+        )
         self.stacks_rows = "target" if weight_norm else "online"
         self.statistics_every_step = weight_norm
 

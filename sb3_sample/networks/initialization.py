@@ -1,4 +1,4 @@
-"""Initialisation of the layers of every network: orthogonal kernels, zero biases."""
+"""Initialisation of the layers of every network: orthogonal or normal kernels, zero biases."""
 
 import math
 
@@ -43,30 +43,39 @@ def init_orthogonal(layer: Dense, gain: float = DEFAULT_GAIN) -> None:
         layer.project()
 
 
-def draw_he_normal(weight: torch.Tensor, fan_in: int) -> torch.Tensor:
+#: Distributions of kernels that are normal, and their variance times the fan-in.
+NORMAL_KERNELS = {"he_normal": 2.0, "lecun_normal": 1.0}
+
+
+def draw_normal(weight: torch.Tensor, fan_in: int, distribution: str) -> torch.Tensor:
     """
-    Draw kernels from a normal distribution truncated at two standard deviations, whose variance after truncation is
-    2 / fan-in, in place.
+    Draw kernels from a normal distribution truncated at two standard deviations, in place.
 
     :param weight: kernel, or a stack of kernels
     :param fan_in: inputs of the layer
+    :param distribution: "he_normal" (variance after truncation 2 / fan-in) or "lecun_normal" (1 / fan-in)
     :return: the same tensor
     """
     # Standard deviation of the standard normal distribution truncated to [-2, 2].
-    std = math.sqrt(2 / fan_in) / 0.8796256610342398
+    std = math.sqrt(NORMAL_KERNELS[distribution] / fan_in) / 0.8796256610342398
     return nn.init.trunc_normal_(weight, 0.0, std, -2 * std, 2 * std)
 
 
 @torch.no_grad()
-def init_he_normal(layer: Dense) -> None:
+def init_normal(layer: Dense, distribution: str) -> None:
     """
-    Draw a kernel by :func:`draw_he_normal`, and set the bias to zero, in place.
+    Draw a kernel by :func:`draw_normal`, and set the bias to zero, in place.
 
     :param layer: the layer to initialise
+    :param distribution: "he_normal" or "lecun_normal"
     """
-    draw_he_normal(layer.weight, layer.in_features)
+    draw_normal(layer.weight, layer.in_features, distribution)
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
+    if isinstance(layer, SpectralNorm):
+        layer.find_direction()
+    if isinstance(layer, UnitNorm):
+        layer.project()
 
 
 def linear(
@@ -77,20 +86,20 @@ def linear(
     gain: float = DEFAULT_GAIN,
     spectral_norm: bool = False,
     unit_norm: bool = False,
-    he_normal: bool = False,
+    kernels: str = "orthogonal",
 ) -> Dense:
     """
-    A dense layer with orthogonal kernels: one, or a stack of independent ones.
+    A dense layer: one, or a stack of independent ones.
 
     :param in_features: width of the input
     :param out_features: width of the output
     :param n_copies: E for a stack of E layers, None for a plain ``nn.Linear``
     :param bias: whether the layer has a bias
-    :param gain: factor on the orthogonal kernel
+    :param gain: factor on an orthogonal kernel
     :param spectral_norm: whether the kernel is divided by its largest singular value, which undoes the gain
     :param unit_norm: whether each unit's input weights have length 1, which ``project`` restores; not with
         ``spectral_norm``
-    :param he_normal: whether the kernel is He-normal instead, without the gain
+    :param kernels: their distribution, "orthogonal", "he_normal" or "lecun_normal"; the last two without the gain
     """
     layer: Dense
     if n_copies is None:
@@ -99,8 +108,8 @@ def linear(
     else:
         ensemble = SpectralEnsembleLinear if spectral_norm else UnitEnsembleLinear if unit_norm else EnsembleLinear
         layer = ensemble(n_copies, in_features, out_features, bias=bias)
-    if he_normal:
-        init_he_normal(layer)
-    else:
+    if kernels == "orthogonal":
         init_orthogonal(layer, gain)
+    else:
+        init_normal(layer, kernels)
     return layer

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, layer_norm
-from sb3_sample.networks.initialization import draw_he_normal, linear
+from sb3_sample.networks.initialization import draw_normal, linear
 from sb3_sample.networks.network import HiddenUnits, Network
 
 
@@ -22,9 +22,9 @@ class SimbaBlock(nn.Module):
     def __init__(self, width: int, expansion: int, n_copies: int | None):
         super().__init__()
         self.norm = layer_norm(width, n_copies)
-        self.dense1 = linear(width, expansion * width, n_copies, he_normal=True)
+        self.dense1 = linear(width, expansion * width, n_copies, kernels="he_normal")
         self.activation = nn.ReLU(inplace=True)
-        self.dense2 = linear(expansion * width, width, n_copies, he_normal=True)
+        self.dense2 = linear(expansion * width, width, n_copies, kernels="he_normal")
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.dense2(self.activation(self.dense1(self.norm(x)))) + x
@@ -78,6 +78,6 @@ class SimbaNet(Network):
         for k, block in enumerate(self.blocks):
             assert isinstance(block, SimbaBlock)
             layers = (block.dense1, None, block.activation, block.dense2)
-            draw = functools.partial(draw_he_normal, fan_in=block.dense1.in_features)
+            draw = functools.partial(draw_normal, fan_in=block.dense1.in_features, distribution="he_normal")
             units.append(HiddenUnits(f"blocks.{k}.dense1", *layers, draw))
         return units

@@ -724,11 +724,13 @@ class SAC(  # type: ignore[misc]  # actor
 
         :param gradient_steps: how many
         :param batch_size: transitions a step; None: the model's own ``batch_size``
+        :raises ValueError: one transition a step, for networks with batch norm
         :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
             the log is written
         """
         assert self.replay_buffer is not None
         batch_size = self.batch_size if batch_size is None else batch_size
+        self.learner.check_rows(batch_size, "batch_size")
         self._take_settings()
         self._set_training_mode(True)
         if self.learner.schedule is None:

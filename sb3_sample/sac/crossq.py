@@ -105,7 +105,7 @@ class CrossQ(SAC):
             sizes = {"critic": (512, 512), "actor": (256, 256)}
             more: dict[str, Any] = {"weight_norm": True, "renorm_warm_up": None, "unbiased": False}
         else:
-            sizes, more = {"critic": (2048, 2048), "actor": (256, 256)}, {}
+            sizes, more = {"critic": (2048, 2048), "actor": (256, 256)}, {"kernels": "lecun_normal"}
         bounds = {"log_std_min": -10.0 if self.weight_norm else -20.0, "clip_log_std": True}
         kwargs = with_weight_decay(with_hidden_sizes(kwargs, "crossq", sizes, more, bounds), self.weight_decay)
         is_adam = kwargs.get("optimizer_class", AdamW) in (AdamW, torch.optim.Adam, torch.optim.AdamW)

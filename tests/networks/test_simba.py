@@ -108,7 +108,7 @@ def test_initial_values() -> None:
         assert layer.weight.std().item() == pytest.approx(std, rel=0.03)
         assert layer.weight.abs().max() <= 2 * std / 0.8796 + 1e-6
         assert not layer.bias.any()  # type: ignore[union-attr]
-    single = linear(50, 3000, None, he_normal=True)
+    single = linear(50, 3000, None, kernels="he_normal")
     assert single.weight.std().item() == pytest.approx(0.2, rel=0.03)
 
 

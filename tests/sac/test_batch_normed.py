@@ -464,11 +464,33 @@ def test_a_batch_of_one_is_refused(agent: str) -> None:
     with pytest.raises(ValueError, match="batch_size must be at least 2 with batch norm, .* not 1"):
         MAKERS[agent](batch_size=1)
     model = MAKERS[agent]()
-    model._n_updates = 2 if agent == "CrossQ" else 0
-    # Of the actor: the critics have two rows.
-    with pytest.raises(ValueError, match="batch norm needs at least 2 rows in training mode"):
+    model.learn(20)
+    before = (model._n_updates, {name: value.clone() for name, value in model.policy.state_dict().items()})
+    with pytest.raises(ValueError, match="transitions of a batch must be at least 2 with batch norm, .* not 1"):
         model.learner.update(random_batch(model, 1))
-    assert all(p.isfinite().all() for p in model.policy.parameters())
+    model.batch_size = 1
+    with pytest.raises(ValueError, match="batch_size must be at least 2 with batch norm, .* not 1"):
+        model.train(1)
+    # Nothing has learned from it, the critics neither, which would have two rows.
+    assert model._n_updates == before[0]
+    assert all(torch.equal(value, before[1][name]) for name, value in model.policy.state_dict().items())
+
+
+def test_initial_kernels_of_crossq_are_lecun_normal() -> None:
+    model = CrossQ("MlpPolicy", vec(), seed=0, device="cpu")
+    layers = [*model.critic.trunk.dense, model.critic.head, *model.actor.trunk.dense, model.actor.mean]
+    for layer in layers:
+        std, n = layer.in_features**-0.5, layer.weight.numel()
+        # The standard error of a normal sample's; the truncated one's is smaller.
+        assert abs(layer.weight.std().item() / std - 1) < 4 / (2 * n) ** 0.5
+        assert 1.5 * std < layer.weight.abs().max() <= 2 * std / 0.8796 + 1e-6
+        assert not layer.bias.any()
+    # Units of CrossQ+WN have length 1 instead.
+    assert CrossQ("MlpPolicy", vec(), weight_norm=True, device="cpu").actor.trunk.kernels == "orthogonal"
+    own = CrossQ("MlpPolicy", vec(), device="cpu", policy_kwargs={"critic_network_kwargs": {"kernels": "orthogonal"}})
+    assert (own.critic.trunk.kernels, own.actor.trunk.kernels) == ("orthogonal", "lecun_normal")
+    with pytest.raises(ValueError, match="kernels must be one of .'lecun_normal', 'orthogonal'., not 'he_normal'"):
+        CrossQ("MlpPolicy", vec(), device="cpu", policy_kwargs={"critic_network_kwargs": {"kernels": "he_normal"}})
 
 
 def test_a_batch_of_one_of_flash_sac() -> None:
