@@ -132,8 +132,8 @@ class DebiasedRQLearner(Learner):
         :param extra: without meaning here
         :param windows: ``n_encoder_steps_due`` batches of windows, if that is not 0
         :return: what to log, by name, scalars on the learner's device
-        :raises ValueError: if ``batch`` is not a batch, has too few transitions for batch norm, or the number of batches
-            of windows is another
+        :raises ValueError: if ``batch`` is not a batch or has too few transitions for batch norm, or the number of
+            batches of windows is another
         """
         check_is_batch(batch)
         self.check_rows(len(batch.rewards), "transitions of a batch")

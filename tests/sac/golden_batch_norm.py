@@ -115,6 +115,7 @@ class BatchNormUpdates:
     named: dict[str, torch.Tensor]
     execution: str
     limits_of_kind: Mapping[str, Limits]
+    takes_moments = True
 
     # ---------------------------------------------------------------- the model
 

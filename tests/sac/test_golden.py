@@ -170,12 +170,18 @@ class Updates:
     scalar_tolerances: ClassVar[tuple[float, float]] = (SCALAR_TOLERANCE, SCALAR_TOLERANCE)
     #: Groups of ``aux`` that are compared; ``grad``: gradients of the update.
     aux: ClassVar[tuple[str, ...]] = ()
+    #: Whether a file may begin within a training, and be of float64.
+    takes_moments: ClassVar[bool] = False
     #: Modules of one learned number.
     learned_numbers: ClassVar[tuple[str, ...]] = ("temp/", "optimism/", "regularizer/")
 
     def __init__(self, data: dict[str, np.ndarray], execution: str = "eager"):
         self.data, self.execution = data, execution
         self.meta = json.loads(str(data["meta"]))
+        # Not compared is not equal: of these methods no file has moments or another precision.
+        if not self.takes_moments:
+            assert not any(key.startswith("adam/") for key in data), "moments of optimizers are not taken over"
+            assert not str(self.meta.get("dtype")).startswith("float64"), "updates are replayed in float32 alone"
         self.dims, self.hyperparameters = self.meta["dims"], self.meta["hyperparameters"]
         self.model = self.build(compile=execution == "compiled")
         self.model._set_training_mode(True)

@@ -41,6 +41,10 @@ PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
 GOALS = spaces.Dict({name: spaces.Box(-10, 10, (3,), np.float32) for name in ("observation", "goal")})
 #: Of episodes of eight steps.
 SHORT = {"max_episode_steps": 8}
+#: Agents of each kind of network and explorer.
+WITH_TASKS = (
+    "BRC", "BRO", "SAC", "SimBa", "DebiasedRQ", "SimbaV2", "XQC", "CrossQ", "CrossQ+WN", "FlashSAC", "DAC", "OAC",
+)  # fmt: skip
 
 
 def tasks(*ids: str, seed: int = 0) -> Any:
@@ -60,13 +64,14 @@ def told(task: Any, n: int | None = None) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("policy", [pytest.param("MlpPolicy", marks=pytest.mark.slow), "MultiInputPolicy"])
-@pytest.mark.parametrize("name", sampled(("BRC", "BRO", "SAC", "SimBa", "DebiasedRQ"), ("BRC", "DebiasedRQ")))
+@pytest.mark.parametrize("name", sampled(WITH_TASKS, ("BRC", "DebiasedRQ")))
 def test_one_task_is_single_task_bit_by_bit(name: str, policy: str) -> None:
     """Nothing is appended and nothing widened, whatever is asked of several tasks."""
-    asked: dict[str, Any] = {} if name == "DebiasedRQ" else {"task_temperatures": True, "target_entropy": [-0.5]}
-    asked |= {} if name == "BRC" else {"multitask": True}
-    multi = make(name, tasks(PENDULUM), policy, **asked).learn(40)
     single = make(name, make_vec_env(PENDULUM, seed=0, env_kwargs=SHORT), "MlpPolicy").learn(40)
+    asked: dict[str, Any] = {} if name == "BRC" else {"multitask": True}
+    if name != "DebiasedRQ":
+        asked |= {"task_temperatures": True, "target_entropy": [single.target_entropy]}
+    multi = make(name, tasks(PENDULUM), policy, **asked).learn(40)
     # DR.Q's random steps include the ends of episodes.
     assert multi._n_updates == single._n_updates == (31 if name == "DebiasedRQ" else 30)
     assert len(state(single)) > 30 and not differing(state(multi), state(single))
