@@ -2,8 +2,9 @@
 SimBa's and SimbaV2's networks: SimBa's beside SBX's, weights of unit norm, ReDo's and the compiler's needs.
 
 ``simba_sbx.npz`` has parameters, inputs, outputs and gradients of the networks of SBX 0.28 (``SimbaVectorCritic`` with
-two critics of two blocks, ``SimbaSquashedGaussianActor`` with one), computed by flax 0.12.8 on a CPU in float32. The
-parameters are SBX's initial ones with biases, scales and the kernel of the log standard deviation moved.
+two critics of two blocks, ``SimbaSquashedGaussianActor`` with one), computed by flax 0.12.8 on a CPU in float32;
+``make_simba_sbx.py`` made it. The parameters are SBX's initial ones with biases, scales and the kernel of the log
+standard deviation moved.
 """
 
 import math
