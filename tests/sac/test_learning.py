@@ -126,6 +126,7 @@ def successor(name: str) -> SAC:
     if name == "XQC":
         return XQC("MlpPolicy", "Pendulum-v1", final_learning_rate=1e-4, **layers, **kwargs)
     if name == "CrossQ":
+        del kwargs["tau"]  # It has no targets.
         return CrossQ("MlpPolicy", "Pendulum-v1", **layers, **kwargs)
     if name == "CrossQ+WN":
         # Critics of unit norm get to Pendulum's values, below -100, by a learning rate a step: docs/crossq.md.
