@@ -147,7 +147,8 @@ def main(arguments: list[str] | None = None) -> None:
     )
 
     log = np.load(folder / "evaluations.npz")
-    run = Run("BRO 0.55M, replay ratio 4", folder, log["timesteps"], log["results"].mean(axis=1))
+    simulator_steps = log["timesteps"] * ENV_ARGUMENTS.get("action_repeat", 1)
+    run = Run("BRO 0.55M, replay ratio 4", folder, simulator_steps, log["results"].mean(axis=1))
     draw(ENV, [Curve(run.label, summarize([run]))], "return").savefig(folder / "learning_curve.png")
     print(f"Saved {folder / 'model.zip'} and {folder / 'learning_curve.png'}.")
     try:

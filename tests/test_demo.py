@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sb3_sample.envs import make_env
+
 pytest.importorskip("matplotlib")
+
+from sb3_sample.plots import draw
 
 
 @pytest.fixture
@@ -24,6 +28,18 @@ def demo(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.setattr(module, "SOLVED", -1000)  # so every evaluation passes
     monkeypatch.setattr(module, "AGENT", dict(model_size=(1, 8), replay_ratio=1, learning_starts=70, device="cpu"))
     return module
+
+
+def test_the_learning_curve_is_over_steps_of_the_simulator(
+    demo: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    returns(demo, monkeypatch, -3000, -1001, -1000, -7)
+    monkeypatch.setattr(demo, "ENV_ARGUMENTS", {"max_episode_steps": 5, "action_repeat": 4})
+    monkeypatch.setattr(demo, "make_env", lambda env, action_repeat, **kwargs: make_env(env, **kwargs))
+    drawn = []
+    monkeypatch.setattr(demo, "draw", lambda env, curves, metric: drawn.extend(curves) or draw(env, curves, metric))
+    demo.main(["--folder", str(tmp_path)])
+    assert list(drawn[0].data["env_step"]) == [80, 160]  # after 20 and 40 decisions
 
 
 def returns(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *means: float) -> list[Any]:

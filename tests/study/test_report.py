@@ -1,6 +1,7 @@
 """The report: what it says of made-up runs, of a study's folder and of the published seeds, and that it is safe."""
 
 import contextlib
+import dataclasses
 import html
 import json
 import re
@@ -37,7 +38,7 @@ pytest.importorskip("jinja2")
 
 ROOT = Path(__file__).parents[2]
 CHEETAH, WALKER, PUSH, OWN = "dmc/cheetah-run-v0", "dmc/walker-run-v0", "metaworld/push-v3", "My/Task-v0"
-LATER = (25_000, 50_000)
+LATER, LATEST = (25_000, 50_000), (50_000, 100_000)
 EVIL = '<script>alert("x")</script>'
 
 
@@ -772,7 +773,7 @@ def test_names_and_tracebacks_are_only_text(folder: StudyFolder, tmp_path: Path)
 
 
 def test_published_runs_and_curves_beside_ours(tmp_path: Path) -> None:
-    rows = runs("BRO", CHEETAH, [200, 300], LATER) + runs("BRO", PUSH, [0.1, 0.2], LATER)
+    rows = runs("BRO", CHEETAH, [200, 300], LATEST) + runs("BRO", PUSH, [0.1, 0.2], LATEST)
     page = written(tmp_path / "r.html", made_up(rows), published=["BRO Fast"], curves=["BRO", "TD-MPC2"])
     legend = [html.unescape(re.sub("<.*?>", "", item)) for item in re.findall(r"<li>(.*?)</li>", page)]
     assert "BRO Fast, published: 10 seeds; of the v2 task on 1 of 2 tasks" in legend
@@ -793,10 +794,40 @@ def test_published_runs_and_curves_beside_ours(tmp_path: Path) -> None:
 
 
 def test_a_published_curve_that_is_called_as_ours_is_another(tmp_path: Path) -> None:
-    rows = runs("SAC", CHEETAH, [200, 300], LATER) + runs("DAC", CHEETAH, [200, 300], LATER)
+    rows = runs("SAC", CHEETAH, [200, 300], LATEST) + runs("DAC", CHEETAH, [200, 300], LATEST)
     look = looks(written(tmp_path / "r.html", made_up(rows), curves=["SAC"]))
     assert look["SAC"] == ("0", "none") and look["DAC"] == ("1", "none")
     assert look["SAC, published: 3 seeds; action repeat not stated"] == ("0", "6 3") and len(look) == 3
+
+
+def test_nothing_is_drawn_where_others_have_not_measured(tmp_path: Path) -> None:
+    """SimbaV2's published curve has the untrained policy and then 100,000 steps; CrossQ's begins at 50,000."""
+
+    def lines_of(task: str, name: str, end: int) -> list[pieces.Line]:
+        table = made_up(runs("a", task, [1, 2], (end // 2, end)))
+        found = build(
+            gather(table), title="", curves=[name], steps=None, groups=None, scores=None, all_tasks=False, reps=2,
+            confidence=0.95, seed=0,
+        )  # fmt: skip
+        figure = next(
+            part
+            for section in found.sections
+            for part in section.parts
+            if isinstance(part, pieces.Figure) and part.name == "tasks"
+        )
+        assert figure.caption.endswith(f"left out where they begin after the last step shown: {name}") == (end < 50_000)
+        assert [agent.published for agent in figure.agents].count(True) == (end >= 50_000)
+        return [line for panel in figure.panels for line in panel.lines if line.agent.published]  # type: ignore[union-attr]
+
+    assert not lines_of("dmc/walker-run-v0", "SimbaV2 (RR=2)", 20_000)
+    (line,) = lines_of("dmc/walker-run-v0", "SimbaV2 (RR=2)", 150_000)
+    assert list(figures._until(line, 150_000).x) == [0, 100_000]  # not interpolated to 150,000
+    ours = line._replace(agent=dataclasses.replace(line.agent, published=False))
+    assert list(figures._until(ours, 150_000).x) == [0, 100_000, 150_000]
+    (line,) = lines_of("HalfCheetah-v5", "CrossQ", 50_000)
+    assert list(figures._until(line, 50_000).x) == [50_000]  # a marker, and its range
+    _, _, _, low, high, *_ = figures._until(line, 50_000)
+    assert low is not None and high is not None and list(low) < list(high)
 
 
 def looks(page: str) -> dict[str, tuple[str, str]]:
@@ -825,7 +856,7 @@ def test_the_mean_of_published_curves_over_tasks() -> None:
 
 
 def test_a_table_of_published_curves_is_drawn(tmp_path: Path) -> None:
-    table = pd.concat([made_up(runs("a", CHEETAH, [1, 2])), study.published_curves(["TD7"], [CHEETAH])])
+    table = pd.concat([made_up(runs("a", CHEETAH, [1, 2], LATER)), study.published_curves(["TD7"], [CHEETAH])])
     text = text_of(written(tmp_path / "r.html", table))
     assert "TD7, published: 5 seeds; action repeat not stated; its steps look one evaluation late" in text
 

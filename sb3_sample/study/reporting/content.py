@@ -289,7 +289,7 @@ def _mean_panels(
                 score = score_for(task, scores)
                 assert score is not None
                 values.append(score.of(np.interp(steps, data["env_step"], data["mean"])))
-            if len(steps):
+            if steps.max(initial=0) > 0:
                 others[label] = looks.curves[label]
                 lines.append(Line(looks.curves[label], steps.astype(float), np.mean(values, axis=0)))
         panels.append(Lines(titles[group], STEPS, "mean of the scores", lines, facts.step))
@@ -299,14 +299,23 @@ def _mean_panels(
 def _tasks(drawn: Sequence[Curves], looks: Looks) -> Section:
     panels: list[Lines] = []
     shown: dict[Agent, None] = {}
+    later: dict[str, None] = {}
     titles = distinct((each.task for each in drawn), TITLE)
     for each in sorted(drawn, key=lambda curves: curves.task):
         ours = [name for name in each.own if not looks.runs[name].published] or list(each.own)
         if not ours:
             continue
+        ends = [each.own[name].data["env_step"].iloc[-1] for name in ours]
+        ends += [run.steps[-1] for name in ours for run in each.under_way[name]]
+        end = float(max(ends))
         lines = []
         curves = [(looks.runs[name], curve) for name, curve in each.own.items()]
-        curves += [(looks.curves[curve.label], curve) for curve in each.others]
+        for curve in each.others:
+            # Of others there is at most the return of an untrained policy.
+            if curve.data["env_step"].between(0, end, inclusive="right").any():
+                curves.append((looks.curves[curve.label], curve))
+            else:
+                later.setdefault(curve.label)
         for agent, curve in curves:
             data = curve.data[curve.data["n_seeds"] > 0]
             shown[agent] = None
@@ -315,15 +324,13 @@ def _tasks(drawn: Sequence[Curves], looks: Looks) -> Section:
             lines.append(Line(agent, *columns) if has_band else Line(agent, *columns[:2]))
         for name, runs in each.under_way.items():
             lines += [Line(looks.runs[name], list(run.steps), list(run.values), thin=True) for run in runs]
-        ends = [each.own[name].data["env_step"].iloc[-1] for name in ours]
-        ends += [run.steps[-1] for name in ours for run in each.under_way[name]]
         y_range = (-0.03, 1.03) if each.metric == "success_rate" else None
-        panels.append(
-            Lines(titles[each.task], STEPS, METRICS.get(each.metric, each.metric), lines, float(max(ends)), y_range)
-        )
+        panels.append(Lines(titles[each.task], STEPS, METRICS.get(each.metric, each.metric), lines, end, y_range))
     if not panels:
         return Section("tasks", "Single tasks", [])
     caption = "Mean and range over seeds; thin: runs that have not got as far; dashed: measured and published by others"
+    if later:
+        caption += f", left out where they begin after the last step shown: {', '.join(later)}"
     order = sorted(shown, key=[*looks.runs.values(), *looks.curves.values()].index)
     return Section("tasks", "Single tasks", [Figure("tasks", caption, panels, order)])
 

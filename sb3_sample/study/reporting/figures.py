@@ -171,7 +171,10 @@ def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
         width = 0.8 if thin else 1.5 if agent.published else 2
         marker = None if len(x) != 1 else "^" if bound else _MARKERS[min(agent.turn, 2)]
         face = "none" if bound else look["color"]
-        axes.plot(x, y, linewidth=width, marker=marker, mfc=face, zorder=2 if agent.published else 3, **look)
+        zorder = 2 if agent.published else 3
+        if marker is not None and low is not None and high is not None:
+            axes.plot([*x, *x], [*low, *high], linewidth=width, zorder=zorder, clip_on=False, **look)
+        axes.plot(x, y, linewidth=width, marker=marker, mfc=face, zorder=zorder, clip_on=marker is None, **look)
     axes.set_xlim(0, panel.x_end or 1)
     if panel.y_range is not None:
         axes.set_ylim(*panel.y_range)
@@ -183,14 +186,17 @@ def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
 
 
 def _until(line: Line, end: float) -> Line:
-    """A line up to an x, so that the hidden rest does not affect the axes."""
+    """
+    A line up to an x, so that the hidden rest does not affect the axes. Our own is interpolated there; evaluations of
+    others may be far apart, and theirs ends with the last one shown.
+    """
     x = np.asarray(line.x, float)
     shown = x <= end
     if shown.all():
         return line
     if not shown.any():
         return Line(line.agent, [], [])
-    steps = np.append(x[shown], end)
+    steps = x[shown] if line.agent.published or x[shown][-1] == end else np.append(x[shown], end)
     y, low, high = (None if ys is None else list(np.interp(steps, x, ys)) for ys in (line.y, line.low, line.high))
     return line._replace(x=list(steps), y=y or [], low=low, high=high)
 
