@@ -14,6 +14,10 @@ from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.multi_task import TaskEmbedding
 from sb3_sample.sac.policy_kwargs import with_weight_decay
+from sb3_sample.warn import warn
+
+#: Width of the critics from which on a CPU takes seconds a gradient step.
+TOO_WIDE = 2048
 
 
 class BRC(SAC):
@@ -57,6 +61,11 @@ class BRC(SAC):
         super()._check_arguments()
         checks.check_critics_described_once(self, "critic_width")
         checks.check_weight_decay(self)
+        if self.device.type == "cpu" and (self.critic_width or 0) >= TOO_WIDE:
+            warn(
+                f"Critics {self.critic_width:,} wide (critic_width) are for a GPU: on a CPU it takes minutes to make "
+                "the model, and seconds a gradient step. critic_width=512 is for CPUs"
+            )
         if self.multitask:
             check_unused(self, ["embedding_size"], "multitask=True")
         elif "features_extractor_class" in self.policy_kwargs:

@@ -323,7 +323,7 @@ def _check_schedule(agent: Any) -> None:
     agent.learning_rate = plain_rate(agent.learning_rate)
     if callable(agent.learning_rate):
         raise ValueError(
-            f"learning_rate={agent.learning_rate!r} is a schedule, and so is "
+            "learning_rate, a function, is a schedule, and so is "
             f"learning_rate_schedule={agent.learning_rate_schedule!r}: pass a number, or learning_rate_schedule=None"
         )
     if 0 < agent.learning_rate < agent.final_learning_rate:

@@ -1,6 +1,7 @@
 """Trunks of actors and critics: their arguments, how they are made, and their modes."""
 
 import copy
+import inspect
 from typing import Any
 
 from gymnasium import spaces
@@ -31,9 +32,10 @@ def network_args(
         if value is None:
             continue
         if network not in OF_HIDDEN_LAYERS:
+            own = ", ".join(key for key in inspect.signature(cls).parameters if key not in ("in_features", "n_copies"))
             raise ValueError(
-                f"{name} describes an MLP, but {who}_network is {network!r}: use {who}_network_kwargs, "
-                f"or {who}_network='mlp'"
+                f"{name} describes an MLP, but {who}_network is {network!r}: use critic_network_kwargs and "
+                f"actor_network_kwargs (its own are {own}), or {who}_network='mlp'"
             )
         if key in kwargs:
             raise ValueError(f"{name} and {who}_network_kwargs[{key!r}] say the same thing: give one of them")

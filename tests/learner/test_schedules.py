@@ -252,7 +252,7 @@ def test_a_learner_alone() -> None:
         ({"schedule_steps": 5}, "schedule_steps=5 means nothing with learning_rate_schedule=None"),
         (
             {"learning_rate_schedule": "linear", "learning_rate": lambda p: p},
-            "learning_rate=.* is a schedule, and so is learning_rate_schedule='linear'",
+            "learning_rate, a function, is a schedule, and so is learning_rate_schedule='linear'",
         ),
         (
             {"cls": XQC, "learning_rate": 1e-5},

@@ -556,7 +556,11 @@ def test_defaults_with_weight_norm() -> None:
         ("XQC", {"policy_kwargs": {"actor_kwargs": {"log_std_min": 3}}}, "log_std_min must lie below log_std_max=2"),
         ("XQC", {"policy_kwargs": {"actor_kwargs": {"target_noise": 3}}}, "actor_kwargs has 'target_noise', but"),
         ("XQC", {"redo_period": 5}, "recycles hidden neurons"),
-        ("FlashSAC", {"policy_kwargs": {"net_arch": [8]}}, "net_arch describes an MLP"),
+        (
+            "FlashSAC",
+            {"policy_kwargs": {"net_arch": [8]}},
+            r"net_arch describes an MLP.* and actor_network_kwargs \(its own are width, n_blocks, expansion\)",
+        ),
         ("FlashSAC", {"policy_kwargs": {"critic_network_kwargs": {"width": 0}}}, "FlashNet needs width >= 1"),
         ("FlashSAC", {"exploration_kwargs": {"longest": 0}}, "longest must be an integer of at least 1, not 0"),
         ("FlashSAC", {"exploration_kwargs": {"exponent": -1}}, "exponent must be at least 0"),

@@ -303,7 +303,7 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (
             SAC,
             {"learning_rate_schedule": "linear", "learning_rate": lambda progress: progress},
-            ("learning_rate_schedule='linear'", "learning_rate="),
+            ("learning_rate_schedule='linear'", "learning_rate, a function"),
         ),
         (SAC, {"final_learning_rate": 1e-5}, ("final_learning_rate=1e-05", "learning_rate_schedule=None")),
         (
