@@ -9,7 +9,7 @@ import functools
 import itertools
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from sb3_sample.envs import published_key
 from sb3_sample.exits import refuse
 from sb3_sample.extras import needing_matplotlib
 from sb3_sample.run_logs import EVALUATIONS, is_truncated, monitor_files, read_evaluations, read_monitors
-from sb3_sample.run_settings import read_settings, run_env_id, study_of
+from sb3_sample.run_settings import RECORD, read_settings, run_env_id, study_of
 from sb3_sample.study_list import is_evaluated, read_list
 
 if TYPE_CHECKING:
@@ -165,6 +165,16 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
 # ---------------------------------------------------------------- runs
 
 
+def _folders(path: Path) -> Iterator[Path]:
+    """The folder and all below it; links are not followed, and the depth is not limited."""
+    waiting = [path] if path.is_dir() else []
+    while waiting:
+        folder = waiting.pop()
+        yield folder
+        with os.scandir(folder) as entries:
+            waiting += [Path(entry) for entry in entries if entry.is_dir(follow_symlinks=False)]
+
+
 def _is_run(folder: Path) -> bool:
     return (folder / EVALUATIONS).exists() or bool(monitor_files(folder))
 
@@ -172,21 +182,19 @@ def _is_run(folder: Path) -> bool:
 def find_runs(path: Path) -> list[Path]:
     """
     :param path: a run's folder, or a folder with such folders at any depth; links are not followed
-    :return: the folders of runs: those with ``evaluations.npz`` or Monitor files. A run's subfolders, such as copies of
-        its files or Monitor files of its evaluations, are no further runs
+    :return: the folders of runs: those with ``evaluations.npz`` or Monitor files. Subfolders of a run are none, such as
+        copies of its files or Monitor files of its evaluations, unless they have a ``run.json``: Monitor files beside
+        those of single tasks are of a training on all of them, and no run
     :raises ValueError: there are none
     """
-    runs = []
-    waiting = [path] if path.is_dir() else []
-    while waiting:
-        folder = waiting.pop()
-        if _is_run(folder):
-            runs.append(folder)
-            continue
-        with os.scandir(folder) as entries:
-            waiting += [Path(entry) for entry in entries if entry.is_dir(follow_symlinks=False)]
-    if not runs:
+    found = {folder for folder in _folders(path) if _is_run(folder)}
+    if not found:
         raise ValueError(f"runs must be folders with an evaluations.npz or Monitor files in or below them, not {path}")
+    recorded = {folder for folder in found if (folder / RECORD).exists()}
+    if path in recorded:
+        return [path]
+    above = {parent for folder in recorded for parent in folder.parents}
+    runs = recorded | {folder for folder in found - above if found.isdisjoint(folder.parents)}
     return sorted(runs, key=lambda folder: (len(folder.name), str(folder)))
 
 

@@ -98,6 +98,16 @@ def test_what_lies_within_a_run_is_no_other_run(tmp_path: Path) -> None:
         (folder / name).mkdir(parents=True, exist_ok=True)
         write_monitor(folder / name / "0.monitor.csv", 1.0, "1,2,3\n")
     assert plots.find_runs(tmp_path) == plots.find_runs(folder) == [folder]
+    # Recorded ones within are runs, of single tasks for example, beside the Monitor files of a training on all.
+    for name in ("b", "a"):
+        (folder / "tasks" / name).mkdir(parents=True)
+        write_monitor(folder / "tasks" / name / "0.monitor.csv", 1.0, "1,2,3\n")
+        (folder / "tasks" / name / "run.json").write_text("{}")
+    tasks = [folder / "tasks" / name for name in ("a", "b")]
+    assert plots.find_runs(tmp_path) == plots.find_runs(folder) == tasks
+    # The folder of a recorded run is that run's.
+    (folder / "run.json").write_text("{}")
+    assert plots.find_runs(folder) == [folder] and plots.find_runs(tmp_path) == [*tasks, folder]
 
 
 def test_a_run_does_not_choose_which_picture_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
