@@ -62,6 +62,8 @@ def has_ended(folder: Path) -> bool:
     """
     made = [*folder.glob("checkpoint-[0-9]*"), *(folder / OFFLINE).glob("checkpoint-[0-9]*")]
     final = [path for path in folder.glob("*.zip") if not path.name.startswith(("best_model.", "rl_model_"))]
+    if not all(path.is_file() for path in final):
+        return True  # Whoever reads the final model refuses what is no file.
     return bool(final) and max(_times(final), default=0) >= max(_times(made), default=0)
 
 
