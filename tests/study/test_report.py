@@ -614,6 +614,10 @@ def test_planned_runs_that_are_not_here_may_have_failed(tmp_path: Path) -> None:
     text = text_of(written(tmp_path / "r.html", made_up(rows), plan=tmp_path / "p.yml"))
     assert "good is ahead of bad, without certainty." in text
     assert "1 planned run of good is not here: if failed, the comparison favours it." in text
+    # One agent is compared with none.
+    alone = made_up([row for row in rows if row[0] == "good"])
+    text = text_of(written(tmp_path / "r.html", alone, plan=tmp_path / "p.yml"))
+    assert "1 planned run of good is not here." in text and "favours" not in text
 
 
 def test_an_empty_study_and_one_without_evaluations(tmp_path: Path) -> None:

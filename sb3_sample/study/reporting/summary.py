@@ -110,7 +110,7 @@ def _lost_text(missed: Mapping[str, Counter[str]], agents: Sequence[str], short:
             state = f"{'is' if n == 1 else 'are'} {'not counted' if kind == 'failed' else 'not here'}"
             favoured = f": {'' if kind == 'failed' else 'if failed, '}the comparison favours "
             if len(those) == 1:
-                whose, end = short[those[0]], f"{favoured}it"
+                whose, end = short[those[0]], "" if len(agents) == 1 else f"{favoured}it"
             elif len(those) == len(agents):
                 whose, end = "each agent", ""
             else:
