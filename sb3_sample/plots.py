@@ -182,19 +182,21 @@ def _is_run(folder: Path) -> bool:
 def find_runs(path: Path) -> list[Path]:
     """
     :param path: a run's folder, or a folder with such folders at any depth; links are not followed
-    :return: the folders of runs: those with ``evaluations.npz`` or Monitor files. Subfolders of a run are none, such as
-        copies of its files or Monitor files of its evaluations, unless they have a ``run.json``: Monitor files beside
-        those of single tasks are of a training on all of them, and no run
+    :return: the folders of runs: those with ``evaluations.npz`` or Monitor files; ``path`` alone if it is one. Within a
+        run with evaluations, a subfolder is a further run only if it has a ``run.json``: others are copies of its files
+        or Monitor files of its evaluations. Monitor files above recorded runs, such as those of single tasks, are of a
+        training on all of them, and no run
     :raises ValueError: there are none
     """
     found = {folder for folder in _folders(path) if _is_run(folder)}
     if not found:
         raise ValueError(f"runs must be folders with an evaluations.npz or Monitor files in or below them, not {path}")
     recorded = {folder for folder in found if (folder / RECORD).exists()}
-    if path in recorded:
-        return [path]
     above = {parent for folder in recorded for parent in folder.parents}
-    runs = recorded | {folder for folder in found - above if found.isdisjoint(folder.parents)}
+    if path in recorded or path in found - above:
+        return [path]
+    evaluated = {folder for folder in found if (folder / EVALUATIONS).exists()}
+    runs = recorded | {folder for folder in found - above if evaluated.isdisjoint(folder.parents)}
     return sorted(runs, key=lambda folder: (len(folder.name), str(folder)))
 
 

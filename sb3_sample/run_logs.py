@@ -58,12 +58,12 @@ def has_ended(folder: Path) -> bool:
     """
     :param folder: a run's folder
     :return: whether it has a final model at least as new as its checkpoints; a run that was ended and goes on has an
-        older one
+        older one. A pipe or a device in its place counts as one, which its reader refuses
     """
     made = [*folder.glob("checkpoint-[0-9]*"), *(folder / OFFLINE).glob("checkpoint-[0-9]*")]
     final = [path for path in folder.glob("*.zip") if not path.name.startswith(("best_model.", "rl_model_"))]
-    if not all(path.is_file() for path in final):
-        return True  # Whoever reads the final model refuses what is no file.
+    if any(path.exists() and not (path.is_file() or path.is_dir()) for path in final):
+        return True
     return bool(final) and max(_times(final), default=0) >= max(_times(made), default=0)
 
 

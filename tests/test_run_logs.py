@@ -1,5 +1,6 @@
 """What a run has logged is read as NumPy and Stable-Baselines3 read it. Hostile files: test_hostile_zoo_files.py."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -97,13 +98,22 @@ def test_what_lies_within_a_run_is_no_other_run(tmp_path: Path) -> None:
     for name in (".", "states/9000", "eval"):
         (folder / name).mkdir(parents=True, exist_ok=True)
         write_monitor(folder / name / "0.monitor.csv", 1.0, "1,2,3\n")
+    # Monitor files alone hide nothing below them: they may be another program's.
+    assert len(plots.find_runs(tmp_path)) == 3 and plots.find_runs(folder) == [folder]
+    (folder / "evaluations.npz").touch()
     assert plots.find_runs(tmp_path) == plots.find_runs(folder) == [folder]
+    (folder / "evaluations.npz").rename(folder / "eval" / "evaluations.npz")
+    assert {folder, folder / "eval"} < set(plots.find_runs(tmp_path))
+    (folder / "eval" / "evaluations.npz").rename(folder / "evaluations.npz")
     # Recorded ones within are runs, of single tasks for example, beside the Monitor files of a training on all.
     for name in ("b", "a"):
         (folder / "tasks" / name).mkdir(parents=True)
         write_monitor(folder / "tasks" / name / "0.monitor.csv", 1.0, "1,2,3\n")
         (folder / "tasks" / name / "run.json").write_text("{}")
     tasks = [folder / "tasks" / name for name in ("a", "b")]
+    (folder / "evaluations.npz").unlink()
+    shutil.rmtree(folder / "states")
+    shutil.rmtree(folder / "eval")
     assert plots.find_runs(tmp_path) == plots.find_runs(folder) == tasks
     # The folder of a recorded run is that run's.
     (folder / "run.json").write_text("{}")

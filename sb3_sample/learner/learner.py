@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim import Optimizer
 
 from sb3_sample.kinds import check_value, one_of
@@ -587,8 +588,9 @@ class Learner(Executable):
         for network, is_stacked in (
             (self.critic, self.critic.trunk.stacks_rows is not None),
             (self.actor, self.actor.trunk.stacks_actor_rows),
+            (self.explorer, self.actor.trunk.stacks_actor_rows),
         ):
-            if not is_stacked and any(isinstance(layer, BatchNorm) for layer in network.modules()):
+            if not is_stacked and any(isinstance(layer, (BatchNorm, _BatchNorm)) for layer in network.modules()):
                 raise ValueError(
                     f"{name} must be at least 2 with batch norm, which takes mean and variance of the batch, not {n}"
                 )

@@ -63,8 +63,8 @@ class BRC(SAC):
         checks.check_weight_decay(self)
         if self.device.type == "cpu" and (self.critic_width or 0) >= TOO_WIDE:
             warn(
-                f"Critics {self.critic_width:,} wide (critic_width) are for a GPU: on a CPU it takes minutes to make "
-                "the model, and seconds a gradient step. critic_width=512 is for CPUs"
+                f"Critics {self.critic_width:,} wide (critic_width) are for a GPU: on a CPU a gradient step takes "
+                "seconds, and making the model up to minutes. critic_width=512 is for CPUs"
             )
         if self.multitask:
             check_unused(self, ["embedding_size"], "multitask=True")

@@ -1,7 +1,7 @@
 """
 Make ``simba_sbx.npz``: parameters, inputs, outputs and gradients of SBX's SimBa networks.
 
-    pip install "sbx-rl==0.28.0" && python tests/networks/make_simba_sbx.py tests/networks/simba_sbx.npz
+    pip install "sbx-rl==0.28.0" "flax==0.12.8" && python tests/networks/make_simba_sbx.py tests/networks/simba_sbx.npz
 
 JAX's random numbers are the same on every machine, sums only to rounding. Gradients are those of the sum of the outputs
 times ``weight...``.

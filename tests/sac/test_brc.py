@@ -69,8 +69,9 @@ def test_defaults() -> None:
     assert BRC.constructor_arguments["critic_width"].default == 4096
     # Critics of the published width are not made here: they take minutes.
     sizes = {"actor_network_kwargs": {"width": 8, "n_blocks": 1}, "n_critics": 1}
-    with pytest.warns(UserWarning, match="Critics 2,048 wide .* are for a GPU.* critic_width=512 is for CPUs"):
+    with pytest.warns(UserWarning, match="Critics 2,048 wide .* are for a GPU.* critic_width=512 is for CPUs") as seen:
         BRC("MlpPolicy", vec(), critic_width=2048, policy_kwargs=sizes, buffer_size=10, device="cpu")
+    assert len(seen) == 1
     for trunk, width, n_blocks in ((model.critic.trunk, 16, 2), (model.actor.trunk, 256, 1)):
         assert isinstance(trunk, BroNet) and (trunk.out_features, len(trunk.blocks)) == (width, n_blocks)
     assert (model.head.n_outputs, model.head.v_min, model.head.v_max) == (101, -10, 10)
