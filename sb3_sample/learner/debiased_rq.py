@@ -8,7 +8,7 @@ import torch
 from sb3_sample.learner.batch import Batch, Extra, Noise, Windows, for_each
 from sb3_sample.learner.embedding_losses import infonce, reward_cross_entropy, symexp_atoms, two_hot
 from sb3_sample.learner.execution import Execution
-from sb3_sample.learner.learner import Learner, check_is_batch
+from sb3_sample.learner.learner import Learner
 
 
 class EmbeddingLoss(NamedTuple):
@@ -135,8 +135,7 @@ class DebiasedRQLearner(Learner):
         :raises ValueError: if ``batch`` is not a batch or has too few transitions for batch norm, or the number of
             batches of windows is another
         """
-        check_is_batch(batch)
-        self.check_rows(len(batch.rewards), "transitions of a batch")
+        self._check_batch(batch)
         given, due = list(windows or ()), self.n_encoder_steps_due
         if len(given) != due:
             raise ValueError(

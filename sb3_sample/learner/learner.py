@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim import Optimizer
 
 from sb3_sample.kinds import check_value, one_of
@@ -569,10 +568,13 @@ class Learner(Executable):
         :return: what to log, by name, scalars on the learner's device
         :raises ValueError: if ``batch`` is not a batch, or has too few transitions for batch norm
         """
-        check_is_batch(batch)
-        self.check_rows(len(batch.rewards), "transitions of a batch")
+        self._check_batch(batch)
         with self._updating():
             return self.step(batch, noise, extra)
+
+    def _check_batch(self, batch: Any) -> None:
+        check_is_batch(batch)
+        self.check_rows(len(batch.rewards), "transitions of a batch")
 
     def check_rows(self, n: int, name: str) -> None:
         """
@@ -590,7 +592,7 @@ class Learner(Executable):
             (self.actor, self.actor.trunk.stacks_actor_rows),
             (self.explorer, self.actor.trunk.stacks_actor_rows),
         ):
-            if not is_stacked and any(isinstance(layer, (BatchNorm, _BatchNorm)) for layer in network.modules()):
+            if not is_stacked and any(isinstance(layer, BatchNorm) for layer in network.modules()):
                 raise ValueError(
                     f"{name} must be at least 2 with batch norm, which takes mean and variance of the batch, not {n}"
                 )

@@ -35,6 +35,11 @@ def init_orthogonal(layer: Dense, gain: float = DEFAULT_GAIN) -> None:
     :param gain: factor on the orthogonal matrix
     """
     draw_orthogonal(layer.weight, gain)
+    _complete(layer)
+
+
+def _complete(layer: Dense) -> None:
+    """Set the bias to zero, and bring a new kernel onto its constraint."""
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
     if isinstance(layer, SpectralNorm):
@@ -70,12 +75,7 @@ def init_normal(layer: Dense, distribution: str) -> None:
     :param distribution: "he_normal" or "lecun_normal"
     """
     draw_normal(layer.weight, layer.in_features, distribution)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)
-    if isinstance(layer, SpectralNorm):
-        layer.find_direction()
-    if isinstance(layer, UnitNorm):
-        layer.project()
+    _complete(layer)
 
 
 def linear(

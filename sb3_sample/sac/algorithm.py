@@ -226,6 +226,7 @@ class SAC(  # type: ignore[misc]  # actor
             self._take_prior_data(self.prior_data)
         self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
+        self.learner.check_rows(self.batch_size, "batch_size")
         checks.check_rule(self)
         checks.check_sampling(self, self.replay_buffer)
         self._plain_attributes = plain_attributes(self)

@@ -689,18 +689,6 @@ def check_critics_described_once(agent: Any, name: str) -> None:
         )
 
 
-def check_batch_size(agent: Any) -> None:
-    """
-    :param agent: an algorithm whose actor takes the mean and variance of a batch
-    :raises ValueError: if a batch has one transition
-    """
-    if agent.batch_size < 2:
-        raise ValueError(
-            f"batch_size must be at least 2 with batch norm, which takes mean and variance of the batch, not "
-            f"{agent.batch_size}"
-        )
-
-
 def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:
     """
     :param kwargs_name: name of an argument that is a dict

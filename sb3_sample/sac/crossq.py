@@ -81,7 +81,6 @@ class CrossQ(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        checks.check_batch_size(self)
         checks.check_weight_decay(self)
         networks = {who: self.policy_kwargs.get(f"{who}_network", "crossq") for who in ("critic", "actor")}
         others = [f"{who}_network={network!r}" for who, network in networks.items() if network != "crossq"]

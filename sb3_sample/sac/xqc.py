@@ -8,7 +8,6 @@ from sb3_sample.constructor import argument
 from sb3_sample.kinds import ABOVE_0, check_value, integer
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.reward_scale import RewardScale
-from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policy_kwargs import with_hidden_sizes
 
@@ -64,10 +63,6 @@ class XQC(SAC):
         check_value("episode_steps", episode_steps, ABOVE_0)
         check_value("action_repeat", action_repeat, integer(1))
         return min(max(1 - 5 * action_repeat / episode_steps, 0.95), 0.995)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        checks.check_batch_size(self)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         sizes = {"critic": (512,) * 4, "actor": (256,) * 4}

@@ -804,21 +804,22 @@ def test_a_published_curve_that_is_called_as_ours_is_another(tmp_path: Path) -> 
     assert look["SAC, published: 3 seeds; action repeat not stated"] == ("0", "6 3") and len(look) == 3
 
 
+def figures_of(table: pd.DataFrame, curve: str) -> dict[str, pieces.Figure]:
+    """Figures of a report by name, with a published curve."""
+    found = build(
+        gather(table), title="", curves=[curve], steps=None, groups=None, scores=None, all_tasks=False, reps=2,
+        confidence=0.95, seed=0,
+    )  # fmt: skip
+    parts = (part for section in found.sections for part in section.parts)
+    return {part.name: part for part in parts if isinstance(part, pieces.Figure)}
+
+
 def test_nothing_is_drawn_where_others_have_not_measured(tmp_path: Path) -> None:
     """SimbaV2's published curve has the untrained policy and then 100,000 steps; CrossQ's begins at 50,000."""
 
     def lines_of(task: str, name: str, end: int) -> list[pieces.Line]:
         table = made_up(runs("a", task, [1, 2], (end // 2, end)))
-        found = build(
-            gather(table), title="", curves=[name], steps=None, groups=None, scores=None, all_tasks=False, reps=2,
-            confidence=0.95, seed=0,
-        )  # fmt: skip
-        figure = next(
-            part
-            for section in found.sections
-            for part in section.parts
-            if isinstance(part, pieces.Figure) and part.name == "tasks"
-        )
+        figure = figures_of(table, name)["tasks"]
         assert figure.caption.endswith(f"left out where they begin after the last step shown: {name}") == (end < 50_000)
         assert [agent.published for agent in figure.agents].count(True) == (end >= 50_000)
         return [line for panel in figure.panels for line in panel.lines if line.agent.published]  # type: ignore[union-attr]
@@ -843,14 +844,7 @@ def looks(page: str) -> dict[str, tuple[str, str]]:
 
 def test_the_mean_of_published_curves_over_tasks() -> None:
     table = made_up(runs("a", CHEETAH, [1], LATER) + runs("a", PUSH, [1], LATER))
-    found = build(
-        gather(table), title="", curves=["BRO"], steps=None, groups=None, scores=None, all_tasks=False, reps=2,
-        confidence=0.95, seed=0,
-    )  # fmt: skip
-    figures = {
-        part.name: part for section in found.sections for part in section.parts if isinstance(part, pieces.Figure)
-    }
-    line = next(line for line in figures["means"].panels[0].lines if line.agent.published)  # type: ignore[union-attr]
+    line = next(line for line in figures_of(table, "BRO")["means"].panels[0].lines if line.agent.published)  # type: ignore[union-attr]
     means = [
         published_curves(task).query("algorithm == 'BRO (RR=10)'").set_index("env_step")["mean"][[25_000, 50_000]]
         for task in (CHEETAH, PUSH)
